@@ -1,0 +1,76 @@
+"""Acquisitions: batches of segments given out under a lease."""
+
+from typing import Literal
+from uuid import UUID
+
+from pydantic import Field
+
+from api_schemas.base import Schema, Timestamp, TrajectoryId
+from api_schemas.projects import Budget
+from api_schemas.strategies import StrategyName
+
+Purpose = Literal["pool", "held_out"]
+AcquisitionStatus = Literal["leased", "labeled", "expired", "released"]
+
+
+class AcquireRequest(Schema):
+    """`strategy` and `lease_seconds` default to the project's. `held_out` draws uniformly from the held-out split."""
+
+    project: UUID
+    count: int = Field(ge=1, le=10_000)
+    strategy: str | None = None
+    purpose: Purpose = "pool"
+    lease_seconds: float | None = Field(default=None, gt=0, le=30 * 86400)
+    labeler: str = Field(default="", max_length=200, description="a name for who will answer; shown, never checked")
+
+
+class AcquisitionItem(Schema):
+    """A segment to label: `length` actions from observation `start` on."""
+
+    rank: int
+    trajectory: TrajectoryId
+    start: int
+    length: int
+    score: float | None
+    labeled: bool
+
+
+class Acquisition(Schema):
+    """One batch. `token` is given to the one who acquired it and must come back with the labels.
+
+    strategy: the one that ranked the batch; `requested_strategy` differs from it at a cold start, before any round.
+    """
+
+    id: UUID
+    project: UUID
+    purpose: Purpose
+    strategy: StrategyName
+    requested_strategy: StrategyName
+    round: UUID | None
+    status: AcquisitionStatus
+    labeler: str
+    token: int | None
+    lease_expires_at: Timestamp
+    created_at: Timestamp
+    items: list[AcquisitionItem]
+    budget: Budget
+
+
+class AcquisitionPending(Schema):
+    """No ranked queue yet: poll the job, then ask again."""
+
+    detail: str
+    job: UUID
+
+
+class ExtendRequest(Schema):
+    """Move the lease's end to `lease_seconds` from now."""
+
+    token: int
+    lease_seconds: float | None = Field(default=None, gt=0, le=30 * 86400)
+
+
+class ReleaseRequest(Schema):
+    """Give back the segments that are not labeled yet."""
+
+    token: int

@@ -1,0 +1,110 @@
+"""Observation and action spaces of a project, and the spaces of the simulators that we ship."""
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from api_schemas.base import Schema
+
+DType = Literal["uint8", "int32", "int64", "float32", "float64"]
+
+
+class Stream(Schema):
+    """One named array of an observation; `shape` has no time axis."""
+
+    dtype: DType
+    shape: tuple[int, ...]
+
+
+class DiscreteActions(Schema):
+    """The integers 0 to n - 1. `groups` names disjoint sets of them for which model error is reported apart."""
+
+    kind: Literal["discrete"] = "discrete"
+    n: int = Field(ge=2)
+    names: tuple[str, ...] = ()
+    groups: dict[str, tuple[int, ...]] = {}
+
+
+class BoxActions(Schema):
+    """Vectors of `shape` between `low` and `high`, in every coordinate."""
+
+    kind: Literal["box"] = "box"
+    shape: tuple[int, ...]
+    low: float = -1.0
+    high: float = 1.0
+
+
+Actions = Annotated[DiscreteActions | BoxActions, Field(discriminator="kind")]
+
+
+class Spaces(Schema):
+    """What an observation and an action of a project look like."""
+
+    observations: dict[str, Stream] = Field(min_length=1)
+    actions: Actions
+
+
+class MiniGridOptions(Schema):
+    """Options of the MiniGrid simulator; room sizes count the walls."""
+
+    task: Literal["key_delivery", "ball_delivery", "object_matching", "any"] = "any"
+    room_size: Literal[6, 8] = 6
+    objects: int = Field(default=3, ge=3, le=14)
+    noisy_tiles: int = Field(default=0, ge=0, le=4)
+    max_steps: int = Field(default=120, ge=1)
+
+    @model_validator(mode="after")
+    def _room_for_the_objects(self) -> "MiniGridOptions":
+        if self.objects > 3 and self.room_size < 8:
+            raise ValueError(f"objects: {self.objects} objects need room_size 8, got room_size {self.room_size}")
+        return self
+
+
+def minigrid_spaces(options: Mapping[str, object]) -> Spaces:
+    """Spaces of the MiniGrid simulator. A contract test holds them equal to the simulator's own."""
+    size = MiniGridOptions.model_validate(dict(options)).room_size
+    names = ("left", "right", "forward", "pickup", "drop", "toggle", "swap")
+    return Spaces(
+        observations={
+            "grid": Stream(dtype="uint8", shape=(size, size, 3)),
+            "carried": Stream(dtype="uint8", shape=(3,)),
+        },
+        actions=DiscreteActions(n=7, names=names, groups={"movement": (0, 1, 2), "interaction": (3, 4, 5, 6)}),
+    )
+
+
+SIMULATOR_SPACES: dict[str, Callable[[Mapping[str, object]], Spaces]] = {"minigrid": minigrid_spaces}
+
+
+class Environment(Schema):
+    """A simulator that we ship (its spaces follow), or the spaces of the user's own robot."""
+
+    simulator: str | None = None
+    options: dict[str, str | int | float | bool] = {}
+    spaces: Spaces | None = None
+
+    @model_validator(mode="after")
+    def _spaces_are_known(self) -> "Environment":
+        if self.simulator is None:
+            if self.spaces is None:
+                raise ValueError("spaces: needed where no simulator is named")
+            return self
+        if self.simulator not in SIMULATOR_SPACES:
+            raise ValueError(f"simulator: {self.simulator!r} is not one of {sorted(SIMULATOR_SPACES)}")
+        try:
+            derived = SIMULATOR_SPACES[self.simulator](self.options)
+        except ValidationError as error:
+            problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+            raise ValueError(f"options: {problems}") from error
+        if self.spaces is not None and self.spaces != derived:
+            raise ValueError(f"spaces: differ from those of simulator {self.simulator!r}; leave them out")
+        return self
+
+    def resolved_spaces(self) -> Spaces:
+        """The project's spaces, whichever way they were given."""
+        if self.spaces is not None:
+            return self.spaces
+        if self.simulator is None:  # the validator refuses this; the check is for the type
+            raise ValueError("spaces: needed where no simulator is named")
+        return SIMULATOR_SPACES[self.simulator](self.options)

@@ -1,0 +1,98 @@
+"""Jobs: names, payloads and states. The database is the truth about them; a carrier brings an id to a worker."""
+
+from typing import Annotated, Literal
+from uuid import UUID
+
+from pydantic import Field
+
+from api_schemas.base import Schema, Timestamp
+from api_schemas.collections import CollectionCreate
+from api_schemas.strategies import StrategyName
+
+RUN_JOB = "asim.run_job"  # the one Celery task; its argument is a job id
+
+Queue = Literal["train", "score", "label", "default"]
+JobState = Literal["queued", "running", "done", "failed"]
+
+
+class Collect(Schema):
+    """Run a behavior in the project's simulator and add its trajectories."""
+
+    kind: Literal["collect"] = "collect"
+    collection: CollectionCreate
+
+
+class TrainRound(Schema):
+    """Train the networks of a round that `strategy` needs, evaluate, then ask for the scoring of `strategy`.
+
+    What the round has already is not trained again, so the same job adds a second strategy's networks to a round.
+    """
+
+    kind: Literal["train_round"] = "train_round"
+    round: UUID
+    strategy: StrategyName
+
+
+class TrainSubgoalGenerator(Schema):
+    """Train the project's subgoal generator on action-free observations; gives way to waiting work."""
+
+    kind: Literal["train_subgoal_generator"] = "train_subgoal_generator"
+    project: UUID
+
+
+class ScoreShard(Schema):
+    """Score one shard of the pool."""
+
+    kind: Literal["score_shard"] = "score_shard"
+    scoring: UUID
+    shard: int
+
+
+class MergeScores(Schema):
+    """Merge all shards of a scoring and select the ranked queue from them."""
+
+    kind: Literal["merge_scores"] = "merge_scores"
+    scoring: UUID
+
+
+class SelectQueue(Schema):
+    """Select a drained queue again from the stored scores, without rescoring."""
+
+    kind: Literal["select_queue"] = "select_queue"
+    scoring: UUID
+    length: int
+
+
+JobPayload = Annotated[
+    Collect | TrainRound | TrainSubgoalGenerator | ScoreShard | MergeScores | SelectQueue, Field(discriminator="kind")
+]
+
+QUEUES: dict[str, Queue] = {
+    "collect": "label",
+    "train_round": "train",
+    "train_subgoal_generator": "train",
+    "score_shard": "score",
+    "merge_scores": "score",
+    "select_queue": "score",
+}
+PRIORITIES: dict[str, int] = {"train_subgoal_generator": -10}  # others 0; higher goes first
+
+
+class Job(Schema):
+    """A job as it stands. `progress` runs from 0 to 1; `error` says why it failed."""
+
+    id: UUID
+    project: UUID
+    kind: str
+    queue: Queue
+    state: JobState
+    attempts: int
+    max_attempts: int
+    progress: float
+    message: str
+    result: dict[str, object]
+    error: str | None
+    created_at: Timestamp
+    started_at: Timestamp | None
+    heartbeat_at: Timestamp | None
+    finished_at: Timestamp | None

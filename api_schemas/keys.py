@@ -1,0 +1,42 @@
+"""API keys. The secret is shown once, at creation; the service keeps its hash."""
+
+from typing import Literal
+from uuid import UUID
+
+from pydantic import Field
+
+from api_schemas.base import Schema, Timestamp
+
+Scope = Literal["admin", "acquire", "label", "read"]
+
+
+class KeyCreate(Schema):
+    """What the holder may do; `admin` is everything."""
+
+    name: str = Field(min_length=1, max_length=200)
+    scopes: list[Scope] = Field(min_length=1)
+
+
+class Key(Schema):
+    """A key without its secret."""
+
+    id: UUID
+    name: str
+    scopes: list[Scope]
+    created_at: Timestamp
+
+
+class KeyCreated(Key):
+    """`secret` goes into `Authorization: Bearer <secret>` and is never shown again."""
+
+    secret: str
+
+
+class Health(Schema):
+    """State of the parts that the service needs."""
+
+    status: Literal["ok", "unavailable"]
+    database: bool
+    blobs: bool
+    workers_alive: int
+    version: str

@@ -1,0 +1,91 @@
+"""Labels: the actions of a segment, accepted once and never overwritten."""
+
+from typing import Literal
+from uuid import UUID
+
+from pydantic import Base64Bytes, Field, StrictInt
+
+from api_schemas.base import Schema, Split, Timestamp, TrajectoryId
+from api_schemas.trajectories import SplitChoice
+
+Action = StrictInt | list[float]
+
+
+class LabelSource(Schema):
+    """Who labeled: a simulator, a robot, a person, or an import of recorded data."""
+
+    kind: Literal["simulator", "robot", "human", "import"] = "import"
+    name: str = Field(default="", max_length=200)
+
+
+class LabelItem(Schema):
+    """Actions of one segment.
+
+    action_sets: where several discrete actions explain a step, all of them, one list a step, `actions` included.
+    residual: how far the labeler's replay of `actions` ended from the observed observation; 0 is exact.
+    """
+
+    trajectory: TrajectoryId
+    start: int = Field(ge=0)
+    actions: list[Action] = Field(min_length=1)
+    action_sets: list[list[int]] | None = None
+    residual: float | None = Field(default=None, ge=0)
+
+
+class LabeledTrajectory(Schema):
+    """A whole trajectory with its actions: seed data, held-out data, a demonstration. No lease is needed.
+
+    content: base64 of an npz file with one array a stream, time first, T + 1 observations.
+    actions: T actions. starts: record only the segments that begin there; default all of them.
+    """
+
+    content: Base64Bytes
+    actions: list[Action] = Field(min_length=1)
+    action_sets: list[list[int]] | None = None
+    starts: list[int] | None = None
+    split: SplitChoice = "auto"
+
+
+class LabelsRequest(Schema):
+    """All or nothing. `acquisition` and its `token` are needed for segments that are under a lease."""
+
+    project: UUID
+    acquisition: UUID | None = None
+    token: int | None = None
+    source: LabelSource = LabelSource()
+    items: list[LabelItem] = Field(default=[], max_length=500)
+    trajectories: list[LabeledTrajectory] = Field(default=[], max_length=500)
+
+
+class LabelReceipt(Schema):
+    """`duplicate`: the same label was there already; nothing changed."""
+
+    trajectory: TrajectoryId
+    start: int
+    status: Literal["created", "duplicate"]
+    split: Split
+
+
+class LabelsAccepted(Schema):
+    """`round` is the round that these labels started, if any."""
+
+    receipts: list[LabelReceipt]
+    created: int
+    duplicates: int
+    watermark: int
+    round: UUID | None
+
+
+class Label(Schema):
+    """A stored label."""
+
+    trajectory: TrajectoryId
+    start: int
+    split: Split
+    actions: list[Action]
+    action_sets: list[list[int]] | None
+    residual: float | None
+    source: LabelSource
+    acquisition: UUID | None
+    watermark: int
+    created_at: Timestamp

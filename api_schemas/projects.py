@@ -1,0 +1,97 @@
+"""Projects: one environment, one model family, one labeling policy."""
+
+from typing import Literal
+from uuid import UUID
+
+from pydantic import Field, model_validator
+
+from api_schemas.base import Schema, Timestamp
+from api_schemas.environments import Environment
+from api_schemas.strategies import DEFAULT_STRATEGY, StrategyName
+
+Family = Literal["grid"]
+
+
+class LabelingPolicy(Schema):
+    """What may be changed while a project lives.
+
+    round_labels: a round starts by itself after this many new pool labels; 0 turns that off.
+    label_budget: pool labels that the project may spend in all; None is no limit.
+    diversify: order the ranked queue so that every prefix of it is a diverse batch.
+    """
+
+    strategy: StrategyName = DEFAULT_STRATEGY
+    diversify: bool = True
+    round_labels: int = Field(default=100, ge=0)
+    label_budget: int | None = Field(default=None, ge=1)
+    lease_seconds: float = Field(default=3600.0, gt=0, le=30 * 86400)
+
+
+class ProjectCreate(Schema):
+    """Segments are windows of `segment_length` transitions, `stride` apart, so they never overlap."""
+
+    name: str = Field(min_length=1, max_length=80, pattern=r"^[^\s/](?:[^/\n]*[^\s/])?$")
+    environment: Environment
+    family: Family = "grid"
+    segment_length: int = Field(default=1, ge=1)
+    stride: int | None = Field(default=None, ge=1, description="default: segment_length")
+    held_out_fraction: float = Field(default=0.1, ge=0, lt=1)
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    policy: LabelingPolicy = LabelingPolicy()
+
+    @model_validator(mode="after")
+    def _segments_do_not_overlap(self) -> "ProjectCreate":
+        if self.stride is not None and self.stride < self.segment_length:
+            raise ValueError(f"stride: {self.stride} is less than segment_length {self.segment_length}")
+        return self
+
+
+class ProjectPatch(Schema):
+    """Fields that are left out stay as they are."""
+
+    strategy: StrategyName | None = None
+    diversify: bool | None = None
+    round_labels: int | None = Field(default=None, ge=0)
+    label_budget: int | None = Field(default=None, ge=1)
+    lease_seconds: float | None = Field(default=None, gt=0, le=30 * 86400)
+
+
+class Budget(Schema):
+    """Pool labels: `spent` are accepted, `reserved` are under a live lease. `total` None is no limit."""
+
+    total: int | None
+    spent: int
+    reserved: int
+    remaining: int | None
+
+
+class PoolCounts(Schema):
+    """Trajectories and segments by split. pool_segments = unlabeled + leased + labeled."""
+
+    pool_trajectories: int
+    pool_segments: int
+    unlabeled: int
+    leased: int
+    labeled: int
+    held_out_trajectories: int
+    held_out_segments: int
+    held_out_labeled: int
+
+
+class Project(Schema):
+    """A project as it stands."""
+
+    id: UUID
+    name: str
+    environment: Environment
+    family: Family
+    segment_length: int
+    stride: int
+    held_out_fraction: float
+    seed: int
+    policy: LabelingPolicy
+    counts: PoolCounts
+    budget: Budget
+    label_watermark: int
+    current_round: UUID | None
+    created_at: Timestamp

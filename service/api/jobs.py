@@ -1,0 +1,41 @@
+"""/jobs and /events."""
+
+from uuid import UUID
+
+from fastapi import APIRouter, Depends
+from sqlalchemy import select
+
+from api_schemas.base import Page
+from api_schemas.events import Event
+from api_schemas.jobs import Job
+from service import events, jobs, projects
+from service.api.dependencies import Cursor, PageSize, ReadSession, requires
+from service.store.queries.listing import page
+from service.store.tables import EventRow, JobRow
+
+router = APIRouter(tags=["jobs"], dependencies=[Depends(requires("read"))])
+
+
+@router.get("/jobs")
+def list_jobs(project: UUID, session: ReadSession, cursor: Cursor = None, limit: PageSize = 100) -> Page[Job]:
+    projects.find(session, project)
+    statement = select(JobRow).where(JobRow.project_id == project)
+    rows, after = page(session, statement, (JobRow.created_at, JobRow.id), cursor, limit, newest_first=True)
+    return Page(items=[jobs.describe(row) for row in rows], next=after)
+
+
+@router.get("/jobs/{job_id}")
+def show_job(job_id: UUID, session: ReadSession) -> Job:
+    return jobs.describe(jobs.find(session, job_id))
+
+
+@router.get("/events")
+def list_events(
+    session: ReadSession, project: UUID | None = None, cursor: Cursor = None, limit: PageSize = 100
+) -> Page[Event]:
+    statement = select(EventRow)
+    if project is not None:
+        projects.find(session, project)
+        statement = statement.where(EventRow.project_id == project)
+    rows, after = page(session, statement, (EventRow.id,), cursor, limit)
+    return Page(items=[events.describe(row) for row in rows], next=after)

@@ -1,0 +1,52 @@
+"""/labels."""
+
+from uuid import UUID
+
+from fastapi import APIRouter, Depends
+from sqlalchemy import select
+
+from api_schemas.base import Page
+from api_schemas.environments import Spaces
+from api_schemas.labels import Label, LabelsAccepted, LabelsRequest
+from service import labels, pool, projects
+from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep, requires
+from service.errors import InvalidField
+from service.labels import LabeledUpload
+from service.store import npz
+from service.store.queries.listing import page
+from service.store.tables import LabelRow
+
+router = APIRouter(prefix="/labels", tags=["labels"])
+reader, labeler = Depends(requires("read")), Depends(requires("label"))
+
+
+@router.post("", status_code=201, dependencies=[labeler])
+def add_labels(request: LabelsRequest, held: ServicesDep, now: Now) -> LabelsAccepted:
+    if not request.items and not request.trajectories:
+        raise InvalidField("items", [], "must hold a label, or trajectories a labeled trajectory")
+    with held.database.read() as session:
+        spaces = projects.spaces_of(projects.find(session, request.project))
+    uploads = _store_trajectories(held, spaces, request)
+    with held.database.write() as session:
+        return labels.accept(session, request, uploads, now, held.settings.job_max_attempts)
+
+
+@router.get("", dependencies=[reader])
+def list_labels(project: UUID, session: ReadSession, cursor: Cursor = None, limit: PageSize = 100) -> Page[Label]:
+    projects.find(session, project)
+    statement = select(LabelRow).where(LabelRow.project_id == project)
+    rows, after = page(session, statement, (LabelRow.watermark,), cursor, limit)
+    return Page(items=[labels.describe(row) for row in rows], next=after)
+
+
+def _store_trajectories(held: Services, spaces: Spaces, request: LabelsRequest) -> list[LabeledUpload]:
+    uploads = []
+    for position, trajectory in enumerate(request.trajectories):
+        name = f"trajectories[{position}]"
+        arrays = npz.parse(trajectory.content, f"{name}.content", held.settings.max_body_bytes)
+        labels.check_actions(spaces, trajectory.actions, trajectory.action_sets, name)
+        stored = pool.store(held.blobs, spaces, arrays, name)
+        uploads.append(
+            LabeledUpload(stored, trajectory.actions, trajectory.action_sets, trajectory.starts, trajectory.split)
+        )
+    return uploads

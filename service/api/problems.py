@@ -1,0 +1,87 @@
+"""Every error as problem details, RFC 9457; FastAPI's own included."""
+
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from sqlalchemy.exc import OperationalError
+from starlette.exceptions import HTTPException
+
+from api_schemas.errors import PROBLEM_JSON, InvalidParam, Problem
+from service.errors import ServiceError
+from service.log import get_logger
+
+log = get_logger("api")
+
+
+def install(app: FastAPI) -> None:
+    """Answer all errors of `app` as problem details."""
+    app.add_exception_handler(ServiceError, _service_error)
+    app.add_exception_handler(RequestValidationError, _malformed)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(OperationalError, _database_error)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def answer(problem: Problem, headers: dict[str, str] | None = None) -> JSONResponse:
+    """The problem as a response."""
+    body = problem.model_dump(mode="json", exclude_none=True)
+    return JSONResponse(body, problem.status, headers=headers, media_type=PROBLEM_JSON)
+
+
+def _service_error(request: Request, error: Exception) -> JSONResponse:
+    if not isinstance(error, ServiceError):
+        raise error
+    headers = {"WWW-Authenticate": "Bearer"} if error.status_code == HTTPStatus.UNAUTHORIZED else None
+    return answer(error.problem(request.url.path), headers)
+
+
+def _malformed(request: Request, error: Exception) -> JSONResponse:
+    if not isinstance(error, RequestValidationError):
+        raise error
+    params = [
+        InvalidParam(
+            name=".".join(str(part) for part in problem["loc"] if part != "body") or "body",
+            reason=str(problem["msg"]).removeprefix("Value error, "),
+            value=str(problem.get("input"))[:200],
+        )
+        for problem in error.errors()
+    ]
+    detail = "; ".join(f"{param.name}: {param.reason}, got {param.value}" for param in params)
+    return answer(_problem("malformed-request", 422, "The request is malformed", detail, request, params))
+
+
+def _http_error(request: Request, error: Exception) -> JSONResponse:
+    if not isinstance(error, HTTPException):
+        raise error
+    title = HTTPStatus(error.status_code).phrase
+    problem = _problem(title.lower().replace(" ", "-"), error.status_code, title, str(error.detail), request)
+    return answer(problem, dict(error.headers) if error.headers else None)
+
+
+def _database_error(request: Request, error: Exception) -> JSONResponse:
+    log.error("database_error", path=request.url.path, error=str(error))
+    detail = "the database did not answer in time; nothing was stored, try again"
+    return answer(
+        _problem("database-unavailable", 503, "The database is unavailable", detail, request), {"Retry-After": "1"}
+    )
+
+
+def _unexpected(request: Request, error: Exception) -> JSONResponse:
+    log.error("unexpected_error", path=request.url.path, exc_info=error)
+    detail = "the service failed; nothing was stored, the log says why"
+    return answer(_problem("internal-error", 500, "The service failed", detail, request))
+
+
+def _problem(
+    name: str, status: int, title: str, detail: str, request: Request, params: list[InvalidParam] | None = None
+) -> Problem:
+    return Problem(
+        type=f"urn:asim:error:{name}",
+        title=title,
+        status=status,
+        detail=detail,
+        instance=request.url.path,
+        invalid_params=params or [],
+    )

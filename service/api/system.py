@@ -1,0 +1,100 @@
+"""/strategies, /keys, /health and /metrics."""
+
+from datetime import datetime, timedelta
+from importlib.metadata import version
+from uuid import UUID
+
+from fastapi import APIRouter, Depends, Response
+from fastapi.responses import JSONResponse, RedirectResponse
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
+from sqlalchemy import select
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from api_schemas.keys import Health, KeyCreate, KeyCreated
+from api_schemas.strategies import CATALOG, Strategy
+from service import keys, projects, rounds
+from service.api.dependencies import Now, ReadSession, Services, ServicesDep, WriteSession, requires
+from service.log import get_logger
+from service.store.queries import jobs as job_queries
+from service.store.tables import ProjectRow
+
+router = APIRouter(tags=["system"])
+reader, admin = Depends(requires("read")), Depends(requires("admin"))
+log = get_logger("api")
+WORKER_SILENCE = timedelta(seconds=30)
+
+
+@router.get("/", include_in_schema=False)
+def home() -> RedirectResponse:
+    return RedirectResponse("/dashboard")
+
+
+@router.get("/strategies", dependencies=[reader])
+def list_strategies() -> list[Strategy]:
+    return list(CATALOG)
+
+
+@router.post("/keys", status_code=201, dependencies=[admin])
+def create_key(request: KeyCreate, session: WriteSession, now: Now, response: Response) -> KeyCreated:
+    created = keys.create(session, request, now)
+    response.headers["Location"] = f"/keys/{created.id}"
+    return created
+
+
+@router.delete("/keys/{key_id}", status_code=204, dependencies=[admin])
+def revoke_key(key_id: UUID, session: WriteSession, now: Now) -> None:
+    keys.revoke(session, key_id, now)
+
+
+@router.get("/health/live")
+def live() -> dict[str, str]:
+    return {"status": "ok"}
+
+
+@router.get("/health/ready", response_model=Health, responses={503: {"model": Health}})
+def ready(held: ServicesDep, now: Now) -> JSONResponse:
+    database, workers = _database_state(held, now - WORKER_SILENCE)
+    blobs = held.blobs.reachable()
+    healthy = database and blobs and workers > 0
+    body = Health(
+        status="ok" if healthy else "unavailable",
+        database=database,
+        blobs=blobs,
+        workers_alive=workers,
+        version=version("asim"),
+    )
+    return JSONResponse(body.model_dump(), 200 if healthy else 503)
+
+
+@router.get("/metrics", response_class=Response, dependencies=[reader])
+def metrics(session: ReadSession, now: Now) -> Response:
+    return Response(generate_latest(_gauges(session, now)), media_type=CONTENT_TYPE_LATEST)
+
+
+def _database_state(held: Services, since: datetime) -> tuple[bool, int]:
+    """Whether the database answers, and how many workers it has heard of since then."""
+    try:
+        with held.database.read() as session:
+            return True, job_queries.live_workers(session, since)
+    except SQLAlchemyError as error:
+        log.warning("database_unreachable", error=str(error))
+        return False, 0
+
+
+def _gauges(session: Session, now: datetime) -> CollectorRegistry:
+    """What the database says now, so that the numbers are right whichever process is asked."""
+    registry = CollectorRegistry()
+    jobs = Gauge("asim_jobs", "Jobs by queue and state", ["queue", "state"], registry=registry)
+    for queue, state, count in job_queries.counts_by_state(session):
+        jobs.labels(queue, state).set(count)
+    segments = Gauge("asim_segments", "Pool segments by state", ["project", "state"], registry=registry)
+    loss = Gauge("asim_model_error_loss", "Next-state loss of the newest round, nats", ["project"], registry=registry)
+    for row in session.scalars(select(ProjectRow)):
+        counts = projects.describe(session, row, now).counts
+        for state in ("unlabeled", "leased", "labeled"):
+            segments.labels(row.name, state).set(getattr(counts, state))
+        points = rounds.curve(session, row).points
+        if points and points[-1].model_error.loss is not None:
+            loss.labels(row.name).set(points[-1].model_error.loss)
+    return registry

@@ -1,0 +1,107 @@
+"""/trajectories and /collections."""
+
+from typing import Annotated
+from uuid import UUID
+
+from fastapi import APIRouter, Depends, Query, Response, UploadFile
+from sqlalchemy import select
+
+from api_schemas.base import Page
+from api_schemas.collections import CollectionCreate
+from api_schemas.jobs import Collect, Job
+from api_schemas.trajectories import SplitChoice, TrajectoriesAdded, Trajectory
+from service import jobs, pool, projects
+from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession, requires
+from service.errors import InvalidField, NoProvenance, NoSimulator
+from service.store import codec, npz
+from service.store.queries import labels as label_queries
+from service.store.queries import pool as pool_queries
+from service.store.queries.listing import page
+from service.store.tables import MembershipRow
+
+router = APIRouter(tags=["trajectories"])
+reader, labeler, admin = Depends(requires("read")), Depends(requires("label")), Depends(requires("admin"))
+Start = Annotated[int, Query(ge=0, description="first observation")]
+Length = Annotated[int | None, Query(ge=0, description="transitions after it; default to the end")]
+NPZ = "application/octet-stream"
+
+
+@router.post("/trajectories", status_code=201, dependencies=[labeler])
+def add_trajectories(
+    project: UUID, files: list[UploadFile], held: ServicesDep, now: Now, split: SplitChoice = "auto"
+) -> TrajectoriesAdded:
+    with held.database.read() as session:
+        spaces = projects.spaces_of(projects.find(session, project))
+    # Blobs first: they are named by content, so a crash before the rows leaves nothing wrong behind.
+    limit = held.settings.max_body_bytes
+    parsed = [(file.filename or "file", npz.parse(file.file.read(), file.filename or "file", limit)) for file in files]
+    stored = [pool.store(held.blobs, spaces, arrays, name) for name, arrays in parsed]
+    with held.database.write() as session:
+        row = projects.find(session, project, lock=True)
+        return TrajectoriesAdded(items=[pool.add(session, row, item, split, now) for item in stored])
+
+
+@router.get("/trajectories", dependencies=[reader])
+def list_trajectories(
+    project: UUID, session: ReadSession, cursor: Cursor = None, limit: PageSize = 100
+) -> Page[Trajectory]:
+    projects.find(session, project)
+    statement = select(MembershipRow).where(MembershipRow.project_id == project)
+    rows, after = page(session, statement, (MembershipRow.id,), cursor, limit)
+    ids = [row.trajectory_id for row in rows]
+    contents = pool_queries.contents(session, ids)
+    labeled = label_queries.labeled_by_trajectory(session, project, ids)
+    items = [pool.describe(row, contents[row.trajectory_id], labeled.get(row.trajectory_id, 0)) for row in rows]
+    return Page(items=items, next=after)
+
+
+@router.get("/trajectories/{trajectory_id}", dependencies=[reader])
+def show_trajectory(trajectory_id: str, project: UUID, session: ReadSession) -> Trajectory:
+    member, content = pool.find(session, projects.find(session, project), trajectory_id)
+    labeled = label_queries.labeled_by_trajectory(session, project, [trajectory_id])
+    return pool.describe(member, content, labeled.get(trajectory_id, 0))
+
+
+@router.get("/trajectories/{trajectory_id}/content", dependencies=[reader], response_class=Response)
+def trajectory_content(
+    trajectory_id: str, project: UUID, held: ServicesDep, start: Start = 0, length: Length = None
+) -> Response:
+    with held.database.read() as session:
+        _, content = pool.find(session, projects.find(session, project), trajectory_id)
+    stop = _stop(content.transitions, start, length)
+    data = held.blobs.get("trajectories", content.blob_sha256)
+    arrays, _ = codec.decode(data, f"trajectory {trajectory_id}", start, stop)
+    return Response(npz.dump(arrays), media_type=NPZ)
+
+
+@router.get("/trajectories/{trajectory_id}/provenance", dependencies=[labeler], response_class=Response)
+def trajectory_provenance(
+    trajectory_id: str, project: UUID, held: ServicesDep, start: Start = 0, length: Length = None
+) -> Response:
+    with held.database.read() as session:
+        member, content = pool.find(session, projects.find(session, project), trajectory_id)
+    if member.provenance_sha256 is None or held.provenance is None:
+        raise NoProvenance(trajectory_id)
+    stop = _stop(content.transitions, start, length)
+    data = held.provenance.get("provenance", member.provenance_sha256)
+    states, extra = codec.decode(data, f"provenance of {trajectory_id}", start, stop)
+    return Response(npz.dump(states, extra["metadata"]), media_type=NPZ)
+
+
+@router.post("/collections", status_code=202, dependencies=[admin])
+def collect(request: CollectionCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Job:
+    project = projects.find(session, request.project)
+    if projects.environment_of(project).simulator is None:
+        raise NoSimulator(project.id)
+    payload = Collect(collection=request)
+    row = jobs.enqueue(session, project.id, payload, project.id, now, held.settings.job_max_attempts)
+    response.headers["Location"] = f"/jobs/{row.id}"
+    return jobs.describe(row)
+
+
+def _stop(transitions: int, start: int, length: int | None) -> int:
+    """One past the last observation of the window."""
+    last = transitions if length is None else start + length
+    if last > transitions or start > transitions:
+        raise InvalidField("start + length", last, f"must be at most {transitions}, the trajectory's transitions")
+    return last + 1

@@ -1,0 +1,62 @@
+"""The API: an application factory, for uvicorn and for tests."""
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from datetime import datetime
+from importlib.metadata import version
+
+from fastapi import FastAPI
+
+from service.api import acquisitions, jobs, labels, problems, projects, rounds, security, system, trajectories
+from service.api.dependencies import Services, utc_now
+from service.carrier import Relay
+from service.dashboard import page
+from service.settings import Settings
+from service.store.blobs import Blobs, ProvenanceBlobs
+from service.store.database import migrate, open_database
+
+
+def create_app(settings: Settings | None = None, clock: Callable[[], datetime] = utc_now) -> FastAPI:
+    """The service on its stores. Embedded mode brings its own schema up to date; elsewhere the command line does."""
+    settings = settings or Settings()
+    app = FastAPI(
+        title="ASIM",
+        version=version("asim"),
+        summary="Active learning for robot world models: which few segments of your action-free data to label next.",
+        lifespan=_lifespan,
+    )
+    app.state.services = open_services(settings, clock)
+    problems.install(app)
+    security.install(app, settings)
+    for module in (projects, trajectories, acquisitions, labels, rounds, jobs, system):
+        app.include_router(module.router)
+    app.include_router(page.router)
+    return app
+
+
+def open_services(settings: Settings, clock: Callable[[], datetime] = utc_now) -> Services:
+    """Open database and stores; in embedded mode they are made where they are missing."""
+    url = settings.resolved_database_url()
+    if settings.embedded:
+        settings.data_folder.mkdir(parents=True, exist_ok=True)
+        migrate(url)
+    provenance = settings.resolved_provenance_url()
+    return Services(
+        settings=settings,
+        database=open_database(url),
+        blobs=Blobs(settings.resolved_blobs_url()),
+        provenance=ProvenanceBlobs(provenance) if provenance else None,
+        clock=clock,
+    )
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    held: Services = app.state.services
+    relay = None if held.settings.embedded else Relay(held.database, held.settings, held.clock)
+    if relay:
+        relay.start()
+    yield
+    if relay:
+        relay.stop()
+    held.database.close()

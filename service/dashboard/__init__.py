@@ -1,0 +1,1 @@
+"""The dashboard: one page whose script polls the JSON API of the same origin."""

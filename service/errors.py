@@ -1,0 +1,223 @@
+"""Errors of the service: one class an error, each a sentence with a status. The API turns them into problem details."""
+
+import re
+from datetime import datetime
+from uuid import UUID
+
+from api_schemas.errors import InvalidParam, Problem
+
+
+class ServiceError(Exception):
+    """Base of all expected errors. The class name becomes the problem's type, its docstring the title."""
+
+    status_code = 400
+
+    def __init__(self, detail: str, invalid_params: list[InvalidParam] | None = None) -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.invalid_params = invalid_params or []
+
+    def problem(self, instance: str | None = None) -> Problem:
+        """The body to answer with."""
+        name = type(self).__name__
+        return Problem(
+            type="urn:asim:error:" + re.sub(r"(?<!^)(?=[A-Z])", "-", name).lower(),
+            title=(self.__doc__ or name).split("\n")[0].rstrip("."),
+            status=self.status_code,
+            detail=self.detail,
+            instance=instance,
+            invalid_params=self.invalid_params,
+        )
+
+
+class UnknownResource(ServiceError):
+    """There is no such thing."""
+
+    status_code = 404
+
+    def __init__(self, noun: str, name: object) -> None:
+        super().__init__(f"there is no {noun} {str(name)[:200]!r}")
+
+
+class InvalidField(ServiceError):
+    """A field has a value that cannot be taken."""
+
+    status_code = 422
+
+    def __init__(self, name: str, value: object, reason: str) -> None:
+        shown = str(value)[:200]
+        super().__init__(f"{name}: {reason}, got {shown}", [InvalidParam(name=name, reason=reason, value=shown)])
+
+
+class UnknownStrategy(InvalidField):
+    """No strategy has this name."""
+
+
+class InvalidLabel(InvalidField):
+    """A label does not fit its segment or the project's action space."""
+
+
+class InvalidTrajectory(InvalidField):
+    """A trajectory does not fit the project's observation space, or its arrays disagree."""
+
+
+class ForeignFile(ServiceError):
+    """A file is truncated or of another format."""
+
+    status_code = 400
+
+    def __init__(self, source: str, reason: str) -> None:
+        super().__init__(f"{source}: {reason}")
+
+
+class CorruptBlob(ServiceError):
+    """A stored blob does not match its hash."""
+
+    status_code = 500
+
+    def __init__(self, key: str, expected: str, found: str) -> None:
+        super().__init__(f"blob {key} should have the hash {expected}, its bytes have {found}")
+
+
+class MissingBlob(ServiceError):
+    """A blob that a row refers to is not in the store."""
+
+    status_code = 500
+
+    def __init__(self, key: str) -> None:
+        super().__init__(f"blob {key} is not in the store")
+
+
+class NameTaken(ServiceError):
+    """Another project has this name."""
+
+    status_code = 409
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"name: a project {name!r} exists already")
+
+
+class PoolExhausted(ServiceError):
+    """The pool has fewer segments than were asked for."""
+
+    status_code = 409
+
+    def __init__(self, asked: int, unlabeled: int, purpose: str) -> None:
+        super().__init__(
+            f"count: asked for {asked} segments, {unlabeled} are unlabeled and free in the {purpose} split"
+        )
+
+
+class BudgetExhausted(ServiceError):
+    """The project's label budget does not cover the batch."""
+
+    status_code = 409
+
+    def __init__(self, asked: int, remaining: int, total: int) -> None:
+        super().__init__(f"count: asked for {asked} segments, {remaining} of the budget of {total} labels remain")
+
+
+class InvalidLeaseToken(ServiceError):
+    """The token is not the one that this acquisition was given."""
+
+    status_code = 403
+
+    def __init__(self, acquisition: UUID, token: int | None) -> None:
+        given = "no token was sent" if token is None else f"{token} is not it"
+        super().__init__(f"token: acquisition {acquisition} needs the token of its lease; {given}")
+
+
+class LeaseLost(ServiceError):
+    """The lease has ended and cannot be used any more."""
+
+    status_code = 410
+
+    def __init__(self, acquisition: UUID, reason: str) -> None:
+        super().__init__(f"acquisition {acquisition}: {reason}")
+
+
+class SegmentLeased(ServiceError):
+    """Somebody else holds the segment."""
+
+    status_code = 423
+
+    def __init__(self, trajectory: str, start: int, until: datetime) -> None:
+        super().__init__(f"segment {trajectory}:{start} is leased to another labeler until {until.isoformat()}")
+
+
+class LabelConflict(ServiceError):
+    """The segment has another label already."""
+
+    status_code = 409
+
+    def __init__(self, trajectory: str, start: int, stored: object, sent: object) -> None:
+        super().__init__(f"segment {trajectory}:{start} is labeled {stored}; {sent} is different and was not stored")
+
+
+class SplitConflict(ServiceError):
+    """The trajectory is in the other split of this project."""
+
+    status_code = 409
+
+    def __init__(self, trajectory: str, split: str, asked: str) -> None:
+        super().__init__(f"split: trajectory {trajectory} is in the split {split!r} of this project, not in {asked!r}")
+
+
+class NothingToLearn(ServiceError):
+    """A round needs labels to train on."""
+
+    status_code = 409
+
+    def __init__(self, project: UUID) -> None:
+        super().__init__(f"project {project} has no pool labels to train on yet")
+
+
+class NoSimulator(ServiceError):
+    """The project names no simulator to run."""
+
+    status_code = 409
+
+    def __init__(self, project: UUID) -> None:
+        super().__init__(f"project {project} names no simulator; upload trajectories instead of collecting them")
+
+
+class NoProvenance(ServiceError):
+    """No simulator states are kept for this trajectory, or not in reach of this process."""
+
+    status_code = 404
+
+    def __init__(self, trajectory: str) -> None:
+        super().__init__(f"trajectory {trajectory} has no provenance here")
+
+
+class NotAllowed(ServiceError):
+    """The key does not allow this."""
+
+    status_code = 403
+
+
+class Unauthenticated(ServiceError):
+    """A valid API key is needed."""
+
+    status_code = 401
+
+
+class CrossOrigin(ServiceError):
+    """The request comes from another site's page."""
+
+    status_code = 403
+
+
+class BodyTooLarge(ServiceError):
+    """The request is larger than this service takes."""
+
+    status_code = 413
+
+
+class JobLost(ServiceError):
+    """Another worker holds this job by now; what this one did is not stored."""
+
+    status_code = 409
+
+    def __init__(self, job: UUID, fence: int) -> None:
+        super().__init__(f"job {job}: fence {fence} is not the current one")

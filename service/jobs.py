@@ -1,0 +1,173 @@
+"""The job table: the truth about every job, whoever carries it to a worker.
+
+A job is claimed under a lease and a fence. Its holder renews the lease by heartbeats; when the holder falls silent the
+lease ends, the job is queued again, and whatever the old holder writes afterwards is refused by its fence.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from uuid import UUID
+
+from pydantic import TypeAdapter
+from sqlalchemy.orm import Session
+
+from api_schemas.jobs import PRIORITIES, QUEUES, Job, JobPayload
+from service import events
+from service.errors import JobLost, UnknownResource
+from service.store.queries import jobs as queries
+from service.store.tables import JobRow, WorkerRow
+
+PAYLOADS: TypeAdapter[JobPayload] = TypeAdapter(JobPayload)
+RETRY_SECONDS = (1.0, 5.0, 20.0, 60.0)  # before the second, third, ... attempt of a job that failed
+
+
+@dataclass(frozen=True)
+class Lease:
+    """What a worker holds while it runs a job."""
+
+    job_id: UUID
+    fence: int
+    queue: str
+    priority: int
+
+
+def enqueue(
+    session: Session, project_id: UUID, payload: JobPayload, subject_id: UUID, now: datetime, max_attempts: int = 5
+) -> JobRow:
+    """A queued job, in the caller's transaction: it exists if and only if the caller's other writes do."""
+    row = JobRow(
+        project_id=project_id,
+        kind=payload.kind,
+        queue=QUEUES[payload.kind],
+        priority=PRIORITIES.get(payload.kind, 0),
+        payload=payload.model_dump(mode="json"),
+        subject_id=subject_id,
+        state="queued",
+        max_attempts=max_attempts,
+        result={},
+        created_at=now,
+    )
+    session.add(row)
+    session.flush()
+    return row
+
+
+def payload_of(row: JobRow) -> JobPayload:
+    """The typed payload."""
+    return PAYLOADS.validate_python(row.payload)
+
+
+def claim_next(session: Session, queues: Sequence[str], owner: str, now: datetime, lease: float) -> JobRow | None:
+    """Claim the next waiting job of these queues, for `lease` seconds."""
+    row = queries.next_job(session, queues, now)
+    return None if row is None else _claim(row, owner, now, lease)
+
+
+def claim(session: Session, job_id: UUID, owner: str, now: datetime, lease: float) -> JobRow | None:
+    """Claim this job; None where it is done, held by another or unknown, so a message may arrive twice."""
+    row = queries.locked_job(session, job_id)
+    if row is None or row.state in ("done", "failed"):
+        return None
+    if row.state == "running" and row.lease_until is not None and row.lease_until > now:
+        return None
+    return _claim(row, owner, now, lease)
+
+
+def lease_of(row: JobRow) -> Lease:
+    """The lease that a claim has just made."""
+    return Lease(row.id, row.fence, row.queue, row.priority)
+
+
+def held(session: Session, lease: Lease) -> JobRow:
+    """The job's row, if this lease is still its newest. Raises JobLost; call it in every transaction of a job."""
+    row = queries.locked_job(session, lease.job_id)
+    if row is None or row.fence != lease.fence or row.state != "running":
+        raise JobLost(lease.job_id, lease.fence)
+    return row
+
+
+def heartbeat(session: Session, lease: Lease, now: datetime, seconds: float, progress: float, message: str) -> None:
+    """Renew the lease and say how far the job is. Raises JobLost."""
+    row = held(session, lease)
+    row.lease_until = now + timedelta(seconds=seconds)
+    row.heartbeat_at = now
+    row.progress = progress
+    row.message = message
+
+
+def complete(session: Session, lease: Lease, result: dict[str, object], now: datetime) -> JobRow:
+    """The job is done. Raises JobLost."""
+    row = held(session, lease)
+    row.state, row.progress, row.result, row.finished_at = "done", 1.0, result, now
+    row.owner = row.lease_until = None
+    events.record(session, row.project_id, "job.done", {"job": str(row.id), "kind": row.kind}, now)
+    return row
+
+
+def fail(session: Session, lease: Lease, error: str, now: datetime, *, retry: bool) -> JobRow:
+    """The attempt failed: queued again after a pause while attempts are left and `retry` holds, else failed."""
+    row = held(session, lease)
+    _end_attempt(session, row, error, now, retry=retry)
+    return row
+
+
+def give_back(session: Session, lease: Lease, now: datetime) -> None:
+    """Queue the job again without counting the attempt: its worker stops, or higher priority work waits."""
+    row = held(session, lease)
+    row.state, row.owner, row.lease_until, row.sent_at = "queued", None, None, None
+    row.attempts -= 1
+    row.heartbeat_at = now
+
+
+def reap(session: Session, now: datetime) -> list[JobRow]:
+    """Queue the jobs of silent workers again, or fail those that have used up their attempts; returns the latter."""
+    failed = []
+    for row in queries.silent(session, now):
+        error = f"worker {row.owner} fell silent in attempt {row.attempts} of {row.max_attempts}"
+        _end_attempt(session, row, error, now, retry=True)
+        if row.state == "failed":
+            failed.append(row)
+    return failed
+
+
+def worker_alive(session: Session, owner: str, queues: Sequence[str], now: datetime) -> None:
+    """A worker says that it is there."""
+    session.merge(WorkerRow(owner=owner, queues=list(queues), heartbeat_at=now))
+
+
+def find(session: Session, job_id: UUID) -> JobRow:
+    """The job's row. Raises UnknownResource."""
+    row = session.get(JobRow, job_id)
+    if row is None:
+        raise UnknownResource("job", job_id)
+    return row
+
+
+def describe(row: JobRow) -> Job:
+    """The job as the API shows it."""
+    fields = {name: getattr(row, name) for name in Job.model_fields if name not in ("project",)}
+    return Job(project=row.project_id, **fields)
+
+
+def _claim(row: JobRow, owner: str, now: datetime, lease: float) -> JobRow:
+    row.state, row.owner = "running", owner
+    row.fence += 1
+    row.attempts += 1
+    row.heartbeat_at, row.lease_until = now, now + timedelta(seconds=lease)
+    row.started_at = row.started_at or now
+    return row
+
+
+def _end_attempt(session: Session, row: JobRow, error: str, now: datetime, *, retry: bool) -> None:
+    row.owner = row.lease_until = row.sent_at = None
+    row.error = error
+    again = retry and row.attempts < row.max_attempts
+    row.state = "queued" if again else "failed"
+    if again:
+        pause = RETRY_SECONDS[min(row.attempts, len(RETRY_SECONDS)) - 1]
+        row.not_before = now + timedelta(seconds=pause)
+    else:
+        row.finished_at = now
+    kind = "job.retried" if again else "job.failed"
+    events.record(session, row.project_id, kind, {"job": str(row.id), "kind": row.kind, "error": error}, now)

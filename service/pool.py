@@ -1,0 +1,158 @@
+"""The pool: trajectories and their membership in a project."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session
+
+from api_schemas.environments import Spaces, Stream
+from api_schemas.trajectories import SplitChoice, Trajectory, TrajectoryReceipt
+from service import events
+from service.errors import InvalidTrajectory, SplitConflict, UnknownResource
+from service.store import codec
+from service.store.blobs import Blobs
+from service.store.queries import pool as queries
+from service.store.tables import MembershipRow, ProjectRow, TrajectoryRow
+
+
+@dataclass(frozen=True)
+class StoredTrajectory:
+    """A trajectory whose blob is written; no row refers to it yet."""
+
+    id: str
+    blob_sha256: str
+    transitions: int
+    streams: dict[str, object]
+    bytes: int
+    source: str
+
+
+def store(blobs: Blobs, spaces: Spaces, arrays: Mapping[str, NDArray[Any]], source: str) -> StoredTrajectory:
+    """Check a trajectory against the spaces and write its blob, outside any transaction. Raises InvalidTrajectory.
+
+    arrays: one a stream, (T + 1, ...), T >= 1.
+    """
+    check(spaces, arrays, source)
+    data = codec.encode(arrays)
+    streams: dict[str, object] = {name: spec.model_dump(mode="json") for name, spec in spaces.observations.items()}
+    transitions = len(next(iter(arrays.values()))) - 1
+    sha256 = blobs.put("trajectories", data)
+    return StoredTrajectory(codec.content_id(arrays), sha256, transitions, streams, len(data), source)
+
+
+def check(spaces: Spaces, arrays: Mapping[str, NDArray[Any]], source: str) -> None:
+    """Every stream there with its dtype and shape, equal lengths, two observations at least, finite numbers."""
+    expected, found = sorted(spaces.observations), sorted(arrays)
+    if expected != found:
+        raise InvalidTrajectory(f"{source}: streams", found, f"must be {expected}")
+    for name, stream in spaces.observations.items():
+        _check_stream(arrays[name], stream, f"{source}: {name}")
+    lengths = {name: len(array) for name, array in arrays.items()}
+    if len(set(lengths.values())) > 1:
+        raise InvalidTrajectory(f"{source}: length", lengths, "must be the same for all streams")
+    if min(lengths.values()) < 2:
+        raise InvalidTrajectory(f"{source}: length", min(lengths.values()), "must be at least 2 observations")
+
+
+def add(
+    session: Session,
+    project: ProjectRow,
+    stored: StoredTrajectory,
+    split: SplitChoice,
+    now: datetime,
+    provenance_sha256: str | None = None,
+) -> TrajectoryReceipt:
+    """Make a stored trajectory a member of the project; the same content twice is one. Raises SplitConflict."""
+    member = queries.membership(session, project.id, stored.id)
+    if member is not None:
+        if split not in ("auto", member.split):
+            raise SplitConflict(stored.id, member.split, split)
+        member.provenance_sha256 = member.provenance_sha256 or provenance_sha256
+        return _receipt(stored, member, "duplicate")
+    if session.get(TrajectoryRow, stored.id) is None:
+        session.add(_trajectory_row(stored, now))
+        session.flush()
+    member = MembershipRow(
+        project_id=project.id,
+        trajectory_id=stored.id,
+        split=content_split(stored.id, project.held_out_fraction) if split == "auto" else split,
+        segments=segment_count(stored.transitions, project.segment_length, project.stride),
+        provenance_sha256=provenance_sha256,
+        created_at=now,
+    )
+    session.add(member)
+    session.flush()
+    events.record(session, project.id, "trajectory.added", {"trajectory": stored.id, "split": member.split}, now)
+    return _receipt(stored, member, "created")
+
+
+def content_split(trajectory_id: str, held_out_fraction: float) -> str:
+    """The split that a trajectory's hash decides."""
+    return "held_out" if int(trajectory_id[:12], 16) / 16**12 < held_out_fraction else "pool"
+
+
+def segment_count(transitions: int, length: int, stride: int) -> int:
+    """How many windows of `length` transitions, `stride` apart, fit."""
+    return 0 if transitions < length else (transitions - length) // stride + 1
+
+
+def find(session: Session, project: ProjectRow, trajectory_id: str) -> tuple[MembershipRow, TrajectoryRow]:
+    """Membership and content of a trajectory of this project. Raises UnknownResource."""
+    member = queries.membership(session, project.id, trajectory_id)
+    content = None if member is None else session.get(TrajectoryRow, trajectory_id)
+    if member is None or content is None:
+        raise UnknownResource(f"trajectory in project {project.id}", trajectory_id)
+    return member, content
+
+
+def describe(member: MembershipRow, content: TrajectoryRow, labeled: int) -> Trajectory:
+    """The trajectory as the API shows it."""
+    return Trajectory(
+        id=content.id,
+        project=member.project_id,
+        split=member.split,  # type: ignore[arg-type]  # pydantic checks the literal
+        transitions=content.transitions,
+        segments=member.segments,
+        labeled=labeled,
+        streams={name: Stream.model_validate(spec) for name, spec in content.streams.items()},
+        bytes=content.bytes,
+        has_provenance=member.provenance_sha256 is not None,
+        created_at=member.created_at,
+    )
+
+
+def _check_stream(array: NDArray[Any], stream: Stream, name: str) -> None:
+    if array.dtype != np.dtype(stream.dtype):
+        raise InvalidTrajectory(f"{name}: dtype", array.dtype, f"must be {stream.dtype}")
+    if array.shape[1:] != stream.shape or array.ndim == 0:
+        raise InvalidTrajectory(f"{name}: shape", array.shape, f"must be (T + 1, {', '.join(map(str, stream.shape))})")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        where = np.argwhere(~np.isfinite(array))[0]
+        raise InvalidTrajectory(f"{name}{where.tolist()}", array[tuple(where)], "must be finite")
+
+
+def _trajectory_row(stored: StoredTrajectory, now: datetime) -> TrajectoryRow:
+    return TrajectoryRow(
+        id=stored.id,
+        blob_sha256=stored.blob_sha256,
+        transitions=stored.transitions,
+        streams=stored.streams,
+        bytes=stored.bytes,
+        created_at=now,
+    )
+
+
+def _receipt(stored: StoredTrajectory, member: MembershipRow, status: str) -> TrajectoryReceipt:
+    return TrajectoryReceipt.model_validate(
+        {
+            "id": stored.id,
+            "source": stored.source,
+            "status": status,
+            "split": member.split,
+            "transitions": stored.transitions,
+        }
+    )

@@ -1,0 +1,114 @@
+"""Projects: one environment, one model family, one labeling policy."""
+
+from datetime import datetime
+from uuid import UUID
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from api_schemas.environments import Environment, Spaces
+from api_schemas.projects import Budget, LabelingPolicy, PoolCounts, Project, ProjectCreate, ProjectPatch
+from service import events
+from service.errors import NameTaken, UnknownResource
+from service.store.queries import pool as pool_queries
+from service.store.queries import rounds as round_queries
+from service.store.tables import ProjectRow
+
+
+def create(session: Session, request: ProjectCreate, now: datetime) -> ProjectRow:
+    """A new project. Raises NameTaken."""
+    if session.scalar(select(ProjectRow.id).where(ProjectRow.name == request.name)) is not None:
+        raise NameTaken(request.name)
+    row = ProjectRow(
+        name=request.name,
+        environment=request.environment.model_dump(mode="json"),
+        spaces=request.environment.resolved_spaces().model_dump(mode="json"),
+        family=request.family,
+        segment_length=request.segment_length,
+        stride=request.stride or request.segment_length,
+        held_out_fraction=request.held_out_fraction,
+        seed=request.seed,
+        policy=request.policy.model_dump(mode="json"),
+        created_at=now,
+    )
+    session.add(row)
+    session.flush()
+    events.record(session, row.id, "project.created", {"name": row.name}, now)
+    return row
+
+
+def find(session: Session, project_id: UUID, *, lock: bool = False) -> ProjectRow:
+    """The project's row, locked on demand where the database locks rows. Raises UnknownResource."""
+    row = session.get(ProjectRow, project_id, with_for_update=lock)
+    if row is None:
+        raise UnknownResource("project", project_id)
+    return row
+
+
+def change(session: Session, project_id: UUID, patch: ProjectPatch, now: datetime) -> ProjectRow:
+    """Change the labeling policy; fields that were not sent stay. A null label_budget lifts the budget."""
+    row = find(session, project_id, lock=True)
+    sent = patch.model_dump(exclude_unset=True)
+    changes = {name: value for name, value in sent.items() if value is not None or name == "label_budget"}
+    row.policy = LabelingPolicy.model_validate(row.policy | changes).model_dump(mode="json")
+    events.record(session, row.id, "project.changed", dict(changes), now)
+    return row
+
+
+def policy_of(row: ProjectRow) -> LabelingPolicy:
+    """The typed labeling policy."""
+    return LabelingPolicy.model_validate(row.policy)
+
+
+def spaces_of(row: ProjectRow) -> Spaces:
+    """The typed observation and action spaces."""
+    return Spaces.model_validate(row.spaces)
+
+
+def environment_of(row: ProjectRow) -> Environment:
+    """The typed environment."""
+    return Environment.model_validate(row.environment)
+
+
+def budget_of(session: Session, row: ProjectRow, now: datetime) -> Budget:
+    """Labels spent and reserved against the budget."""
+    return _budget(row, pool_queries.split_count(session, row.id, "pool", now))
+
+
+def describe(session: Session, row: ProjectRow, now: datetime) -> Project:
+    """The project as the API shows it."""
+    pool = pool_queries.split_count(session, row.id, "pool", now)
+    held_out = pool_queries.split_count(session, row.id, "held_out", now)
+    current = round_queries.current_round(session, row.id)
+    counts = PoolCounts(
+        pool_trajectories=pool.trajectories,
+        pool_segments=pool.segments,
+        unlabeled=pool.free,
+        leased=pool.leased,
+        labeled=pool.labeled,
+        held_out_trajectories=held_out.trajectories,
+        held_out_segments=held_out.segments,
+        held_out_labeled=held_out.labeled,
+    )
+    return Project(
+        id=row.id,
+        name=row.name,
+        environment=environment_of(row),
+        family=row.family,  # type: ignore[arg-type]  # pydantic checks the literal
+        segment_length=row.segment_length,
+        stride=row.stride,
+        held_out_fraction=row.held_out_fraction,
+        seed=row.seed,
+        policy=policy_of(row),
+        counts=counts,
+        budget=_budget(row, pool),
+        label_watermark=row.label_watermark,
+        current_round=current.id if current else None,
+        created_at=row.created_at,
+    )
+
+
+def _budget(row: ProjectRow, pool: pool_queries.SplitCount) -> Budget:
+    total = policy_of(row).label_budget
+    remaining = None if total is None else max(0, total - pool.labeled - pool.leased)
+    return Budget(total=total, spent=pool.labeled, reserved=pool.leased, remaining=remaining)

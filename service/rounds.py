@@ -1,0 +1,155 @@
+"""Rounds: one retraining on all labels up to a watermark, whose stages are stored as they are done."""
+
+from datetime import datetime
+from uuid import UUID
+
+from sqlalchemy.orm import Session
+
+from api_schemas.jobs import TrainRound, TrainSubgoalGenerator
+from api_schemas.rounds import ModelError, ModelErrorCurve, ModelErrorPoint, Round, Stage
+from service import events, jobs, projects
+from service.errors import NothingToLearn, UnknownResource
+from service.store.queries import jobs as job_queries
+from service.store.queries import labels as label_queries
+from service.store.queries import pool as pool_queries
+from service.store.queries import rounds as queries
+from service.store.tables import ModelVersionRow, ProjectRow, RoundRow
+
+
+def request(session: Session, project: ProjectRow, now: datetime, max_attempts: int = 5) -> RoundRow:
+    """A round on all labels that are there now, and its job. Raises NothingToLearn."""
+    labels = label_queries.label_count(session, project.id, "pool", project.label_watermark)
+    if labels == 0:
+        raise NothingToLearn(project.id)
+    row = RoundRow(
+        project_id=project.id,
+        number=queries.last_number(session, project.id) + 1,
+        watermark=project.label_watermark,
+        labels=labels,
+        status="queued",
+        stages=[],
+        created_at=now,
+    )
+    session.add(row)
+    session.flush()
+    payload = TrainRound(round=row.id, strategy=projects.policy_of(project).strategy)
+    row.job_id = jobs.enqueue(session, project.id, payload, row.id, now, max_attempts).id
+    project.round_watermark = project.pool_labels
+    _request_subgoal_generator(session, project, now, max_attempts)
+    events.record(session, project.id, "round.requested", {"round": str(row.id), "labels": labels}, now)
+    return row
+
+
+def due(project: ProjectRow) -> bool:
+    """True where enough pool labels have come since the last round was requested."""
+    every = projects.policy_of(project).round_labels
+    return every > 0 and project.pool_labels - project.round_watermark >= every
+
+
+def find(session: Session, round_id: UUID, *, lock: bool = False) -> RoundRow:
+    """The round's row. Raises UnknownResource."""
+    row = session.get(RoundRow, round_id, with_for_update=lock)
+    if row is None:
+        raise UnknownResource("round", round_id)
+    return row
+
+
+def begin_training(session: Session, round_id: UUID) -> None:
+    """The round's job has started; a round that is in use already stays so."""
+    row = find(session, round_id, lock=True)
+    row.status = "training" if row.status == "queued" else row.status
+
+
+def stage_done(session: Session, round_id: UUID, name: str, seconds: float) -> None:
+    """Note a finished stage, in the transaction that stores its result."""
+    row = find(session, round_id, lock=True)
+    row.stages = [*row.stages, Stage(name=name, seconds=round(seconds, 3)).model_dump()]
+
+
+def record_error(session: Session, round_id: UUID, error: ModelError, now: datetime) -> None:
+    """Store the round's model error."""
+    row = find(session, round_id, lock=True)
+    row.model_error = error.model_dump(mode="json")
+    data: dict[str, object] = {"round": str(row.id), "labels": row.labels, "loss": error.loss}
+    events.record(session, row.project_id, "round.evaluated", data, now)
+
+
+def begin_scoring(session: Session, round_id: UUID) -> None:
+    """Training and evaluation are done."""
+    row = find(session, round_id, lock=True)
+    row.status = "scoring" if row.status == "training" else row.status
+
+
+def make_current(session: Session, round_id: UUID, now: datetime) -> None:
+    """The round's queue is ready: its models and queue are in use from now on. An older round never replaces it."""
+    row = find(session, round_id, lock=True)
+    if row.status in ("current", "superseded", "failed"):
+        return
+    current = queries.current_round(session, row.project_id)
+    if current is not None and current.number > row.number:
+        row.status = "superseded"
+    else:
+        if current is not None:
+            current.status = "superseded"
+        row.status = "current"
+    row.finished_at = now
+    events.record(session, row.project_id, f"round.{row.status}", {"round": str(row.id), "number": row.number}, now)
+
+
+def fail(session: Session, round_id: UUID, error: str, now: datetime) -> None:
+    """The round's job gave up; a round that is in use stays in use."""
+    row = find(session, round_id, lock=True)
+    if row.status in ("current", "superseded"):
+        return
+    row.status, row.error, row.finished_at = "failed", error, now
+    events.record(session, row.project_id, "round.failed", {"round": str(row.id), "error": error}, now)
+
+
+def curve(session: Session, project: ProjectRow) -> ModelErrorCurve:
+    """The learning curve, oldest round first."""
+    points = [
+        ModelErrorPoint(
+            round=row.id,
+            number=row.number,
+            labels=row.labels,
+            model_error=ModelError.model_validate(row.model_error),
+            created_at=row.created_at,
+        )
+        for row in queries.evaluated_rounds(session, project.id)
+    ]
+    return ModelErrorCurve(project=project.id, points=points)
+
+
+def describe(session: Session, row: RoundRow) -> Round:
+    """The round as the API shows it."""
+    models = {_model_name(model): model.id for model in queries.models_of(session, row.id)}
+    return Round(
+        id=row.id,
+        project=row.project_id,
+        number=row.number,
+        watermark=row.watermark,
+        labels=row.labels,
+        status=row.status,  # type: ignore[arg-type]  # pydantic checks the literal
+        stages=[Stage.model_validate(stage) for stage in row.stages],
+        models=models,
+        model_error=None if row.model_error is None else ModelError.model_validate(row.model_error),
+        job=row.job_id,
+        error=row.error,
+        created_at=row.created_at,
+        finished_at=row.finished_at,
+    )
+
+
+def _request_subgoal_generator(session: Session, project: ProjectRow, now: datetime, max_attempts: int) -> None:
+    """The generator learns from action-free data only, so it follows the pool's growth and not the labels."""
+    newest = queries.newest_model(session, project.id, "subgoal_generator")
+    members = pool_queries.newest_membership(session, project.id, "pool")
+    if newest is not None and members < 2 * newest.watermark:
+        return
+    if job_queries.unfinished(session, project.id) is None:
+        payload = TrainSubgoalGenerator(project=project.id)
+        jobs.enqueue(session, project.id, payload, project.id, now, max_attempts)
+
+
+def _model_name(model: ModelVersionRow) -> str:
+    return f"{model.kind}-{model.member}" if model.kind == "ensemble" else model.kind

@@ -1,0 +1,52 @@
+"""The only place that reads the environment: ASIM_* variables, or the defaults of embedded mode."""
+
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """Where things are kept and how long a worker may be silent.
+
+    data_folder: everything of embedded mode lives here, unless a URL below says otherwise.
+    provenance_url: simulator states and behavior provenance; "" for a process that must not reach them (training and
+    scoring workers are started so).
+    broker_url: Redis or RabbitMQ; set, jobs are carried by Celery, unset, by the embedded runner.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="ASIM_", frozen=True)
+
+    data_folder: Path = Path("asim-data")
+    database_url: str = ""
+    blobs_url: str = ""
+    provenance_url: str | None = None
+    broker_url: str = ""
+    celery_prefix: str = "asim"
+    job_lease_seconds: float = Field(default=15.0, gt=0)
+    job_max_attempts: int = Field(default=5, ge=1)
+    poll_seconds: float = Field(default=0.2, gt=0)
+    queue_length: int = Field(default=2000, ge=1, description="ranked segments kept ready in the database")
+    shard_transitions: int = Field(default=100_000, ge=1)
+    torch_threads: int = Field(default=1, ge=1)
+    allowed_hosts: tuple[str, ...] = ("127.0.0.1", "localhost", "[::1]")
+    max_body_bytes: int = Field(default=256 * 2**20, ge=1)
+
+    @property
+    def embedded(self) -> bool:
+        """True where no broker carries jobs."""
+        return not self.broker_url
+
+    def resolved_database_url(self) -> str:
+        """The given URL, or a SQLite file in the data folder."""
+        return self.database_url or f"sqlite:///{(self.data_folder / 'asim.db').absolute()}"
+
+    def resolved_blobs_url(self) -> str:
+        """The given URL, or a folder in the data folder."""
+        return self.blobs_url or str((self.data_folder / "blobs").absolute())
+
+    def resolved_provenance_url(self) -> str | None:
+        """The given URL, or a folder in the data folder; None where this process may not reach provenance."""
+        if self.provenance_url == "":
+            return None
+        return self.provenance_url or str((self.data_folder / "provenance").absolute())

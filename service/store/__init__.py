@@ -1,0 +1,1 @@
+"""Tables, sessions, queries and blobs: every SELECT of the product lives here."""

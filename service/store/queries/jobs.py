@@ -1,0 +1,62 @@
+"""The job table as a queue."""
+
+from collections.abc import Sequence
+from datetime import datetime
+from uuid import UUID
+
+from sqlalchemy import ColumnElement, func, or_, select
+from sqlalchemy.orm import Session
+
+from service.store.tables import JobRow, WorkerRow
+
+
+def next_job(session: Session, queues: Sequence[str], now: datetime) -> JobRow | None:
+    """The job to claim next: highest priority, then oldest. Rows that another claims at this moment are passed over."""
+    statement = select(JobRow).where(_waiting(queues, now))
+    statement = statement.order_by(JobRow.priority.desc(), JobRow.created_at, JobRow.id).limit(1)
+    return session.scalar(statement.with_for_update(skip_locked=True))
+
+
+def locked_job(session: Session, job_id: UUID) -> JobRow | None:
+    """The job's row, locked where the database locks rows."""
+    return session.scalar(select(JobRow).where(JobRow.id == job_id).with_for_update())
+
+
+def higher_waiting(session: Session, queues: Sequence[str], priority: int, now: datetime) -> bool:
+    """True where a job of higher priority waits in one of the queues."""
+    statement = select(JobRow.id).where(_waiting(queues, now), JobRow.priority > priority)
+    return session.scalar(statement.limit(1)) is not None
+
+
+def unfinished(session: Session, subject_id: UUID) -> JobRow | None:
+    """A queued or running job that works on the subject."""
+    statement = select(JobRow).where(JobRow.subject_id == subject_id, JobRow.state.in_(("queued", "running")))
+    return session.scalar(statement.order_by(JobRow.created_at).limit(1))
+
+
+def silent(session: Session, now: datetime) -> Sequence[JobRow]:
+    """Running jobs whose lease has ended."""
+    statement = select(JobRow).where(JobRow.state == "running", JobRow.lease_until <= now)
+    return session.scalars(statement.with_for_update(skip_locked=True)).all()
+
+
+def unsent(session: Session, stale: datetime, limit: int) -> Sequence[JobRow]:
+    """Queued jobs that no carrier was given, or was given before `stale`."""
+    statement = select(JobRow).where(JobRow.state == "queued", or_(JobRow.sent_at.is_(None), JobRow.sent_at <= stale))
+    return session.scalars(statement.order_by(JobRow.created_at).limit(limit)).all()
+
+
+def counts_by_state(session: Session) -> Sequence[tuple[str, str, int]]:
+    """(queue, state, number of jobs)."""
+    statement = select(JobRow.queue, JobRow.state, func.count()).group_by(JobRow.queue, JobRow.state)
+    return [(queue, state, count) for queue, state, count in session.execute(statement)]
+
+
+def live_workers(session: Session, since: datetime) -> int:
+    """Workers heard of since then."""
+    return session.scalar(select(func.count()).where(WorkerRow.heartbeat_at >= since)) or 0
+
+
+def _waiting(queues: Sequence[str], now: datetime) -> ColumnElement[bool]:
+    ready = or_(JobRow.not_before.is_(None), JobRow.not_before <= now)
+    return (JobRow.state == "queued") & JobRow.queue.in_(queues) & ready

@@ -1,0 +1,62 @@
+"""Cursor pagination: opaque cursors over a row's sort key."""
+
+import base64
+import binascii
+import json
+from typing import Any, TypeVar
+
+from sqlalchemy import Select, tuple_
+from sqlalchemy.orm import InstrumentedAttribute, Session
+
+from service.errors import InvalidField
+
+R = TypeVar("R")
+
+
+def page(
+    session: Session,
+    statement: Select[R],
+    key: tuple[InstrumentedAttribute[Any], ...],
+    cursor: str | None,
+    limit: int,
+    *,
+    newest_first: bool = False,
+) -> tuple[list[R], str | None]:
+    """Rows after `cursor` in the order of `key`, and the cursor of the next page. Raises InvalidField."""
+    if cursor is not None:
+        after = tuple_(*[_parse(column, value) for column, value in zip(key, _decode(cursor, len(key)), strict=True)])
+        statement = statement.where(tuple_(*key) < after if newest_first else tuple_(*key) > after)
+    order = [column.desc() if newest_first else column.asc() for column in key]
+    rows = list(session.scalars(statement.order_by(*order).limit(limit + 1)))
+    more = len(rows) > limit
+    return rows[:limit], _encode(rows[limit - 1], key) if more else None
+
+
+def _encode(row: object, key: tuple[InstrumentedAttribute[Any], ...]) -> str:
+    values = [getattr(row, column.key) for column in key]
+    text = json.dumps([value if isinstance(value, int | str) else str(value) for value in values])
+    return base64.urlsafe_b64encode(text.encode()).decode()
+
+
+def _decode(cursor: str, length: int) -> list[Any]:
+    try:
+        values = json.loads(base64.urlsafe_b64decode(cursor.encode()))
+    except (ValueError, binascii.Error) as error:
+        raise InvalidField("cursor", cursor, "is not one that this service gave out") from error
+    if not isinstance(values, list) or len(values) != length:
+        raise InvalidField("cursor", cursor, "is not one of this listing")
+    return values
+
+
+def _parse(column: InstrumentedAttribute[Any], value: Any) -> Any:
+    kind = column.type.python_type
+    try:
+        return (
+            value
+            if isinstance(value, kind)
+            else kind.fromisoformat(value)
+            if hasattr(kind, "fromisoformat")
+            else kind(value)
+        )
+    except (TypeError, ValueError) as error:
+        raise InvalidField("cursor", value, "is not one of this listing") from error

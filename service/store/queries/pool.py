@@ -1,0 +1,97 @@
+"""Counts and members of a project's splits."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from uuid import UUID
+
+from sqlalchemy import ColumnElement, and_, func, select
+from sqlalchemy.orm import Session
+
+from service.store.tables import ClaimRow, LabelRow, MembershipRow, TrajectoryRow
+
+
+@dataclass(frozen=True)
+class SplitCount:
+    """Trajectories and segments of one split; live leases and labels among them."""
+
+    trajectories: int
+    segments: int
+    leased: int
+    labeled: int
+
+    @property
+    def free(self) -> int:
+        """Segments that are neither leased nor labeled."""
+        return self.segments - self.leased - self.labeled
+
+
+def split_count(session: Session, project_id: UUID, split: str, now: datetime) -> SplitCount:
+    """Counts of one split at `now`."""
+    members = select(func.count(), func.coalesce(func.sum(MembershipRow.segments), 0)).where(
+        MembershipRow.project_id == project_id, MembershipRow.split == split
+    )
+    trajectories, segments = session.execute(members).one()
+    leased = _count(session, live_claim(now), ClaimRow.project_id == project_id, ClaimRow.purpose == split)
+    labeled = _count(session, LabelRow.project_id == project_id, LabelRow.split == split)
+    return SplitCount(trajectories, int(segments), leased, labeled)
+
+
+def live_claim(now: datetime) -> ColumnElement[bool]:
+    """The lease has not expired."""
+    return ClaimRow.expires_at > now
+
+
+def membership(session: Session, project_id: UUID, trajectory_id: str) -> MembershipRow | None:
+    """The trajectory's membership in the project."""
+    return session.scalar(
+        select(MembershipRow).where(
+            MembershipRow.project_id == project_id, MembershipRow.trajectory_id == trajectory_id
+        )
+    )
+
+
+def memberships(
+    session: Session, project_id: UUID, split: str, first: int = 0, last: int = 2**62
+) -> Sequence[MembershipRow]:
+    """Members of a split in the order they came, by id from `first` to `last`."""
+    statement = select(MembershipRow).where(
+        MembershipRow.project_id == project_id, MembershipRow.split == split, MembershipRow.id.between(first, last)
+    )
+    return session.scalars(statement.order_by(MembershipRow.id)).all()
+
+
+def newest_membership(session: Session, project_id: UUID, split: str) -> int:
+    """Id of the youngest member of a split; 0 where it is empty."""
+    statement = select(func.max(MembershipRow.id)).where(
+        MembershipRow.project_id == project_id, MembershipRow.split == split
+    )
+    return session.scalar(statement) or 0
+
+
+def contents(session: Session, trajectory_ids: Sequence[str]) -> dict[str, TrajectoryRow]:
+    """Trajectory rows by id."""
+    found: dict[str, TrajectoryRow] = {}
+    for i in range(0, len(trajectory_ids), 500):  # databases bound the number of parameters
+        rows = session.scalars(select(TrajectoryRow).where(TrajectoryRow.id.in_(trajectory_ids[i : i + 500])))
+        found |= {row.id: row for row in rows}
+    return found
+
+
+def taken_starts(session: Session, project_id: UUID, split: str, now: datetime) -> dict[str, set[int]]:
+    """Starts by trajectory of the segments that are labeled or under a live lease."""
+    labeled = select(LabelRow.trajectory_id, LabelRow.start).where(
+        LabelRow.project_id == project_id, LabelRow.split == split
+    )
+    leased = select(ClaimRow.trajectory_id, ClaimRow.start).where(
+        and_(ClaimRow.project_id == project_id, ClaimRow.purpose == split, live_claim(now))
+    )
+    taken: dict[str, set[int]] = {}
+    for statement in (labeled, leased):
+        for trajectory, start in session.execute(statement):
+            taken.setdefault(trajectory, set()).add(start)
+    return taken
+
+
+def _count(session: Session, *where: ColumnElement[bool]) -> int:
+    return session.scalar(select(func.count()).where(*where)) or 0

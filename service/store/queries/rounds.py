@@ -1,0 +1,37 @@
+"""Rounds and model versions."""
+
+from collections.abc import Sequence
+from uuid import UUID
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from service.store.tables import ModelVersionRow, RoundRow
+
+
+def current_round(session: Session, project_id: UUID) -> RoundRow | None:
+    """The round whose models and queue are in use."""
+    return session.scalar(select(RoundRow).where(RoundRow.project_id == project_id, RoundRow.status == "current"))
+
+
+def last_number(session: Session, project_id: UUID) -> int:
+    """Number of the project's youngest round; 0 before the first."""
+    return session.scalar(select(func.max(RoundRow.number)).where(RoundRow.project_id == project_id)) or 0
+
+
+def evaluated_rounds(session: Session, project_id: UUID) -> Sequence[RoundRow]:
+    """Rounds with a model error, oldest first."""
+    statement = select(RoundRow).where(RoundRow.project_id == project_id, RoundRow.model_error.is_not(None))
+    return session.scalars(statement.order_by(RoundRow.number)).all()
+
+
+def models_of(session: Session, round_id: UUID) -> Sequence[ModelVersionRow]:
+    """The networks of a round, members of an ensemble in order."""
+    statement = select(ModelVersionRow).where(ModelVersionRow.round_id == round_id)
+    return session.scalars(statement.order_by(ModelVersionRow.kind, ModelVersionRow.member)).all()
+
+
+def newest_model(session: Session, project_id: UUID, kind: str) -> ModelVersionRow | None:
+    """The youngest network of a kind."""
+    statement = select(ModelVersionRow).where(ModelVersionRow.project_id == project_id, ModelVersionRow.kind == kind)
+    return session.scalar(statement.order_by(ModelVersionRow.created_at.desc()).limit(1))

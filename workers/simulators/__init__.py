@@ -1,0 +1,1 @@
+"""Simulators and the scripted behaviors that act in them, behind one protocol (`base`) and one list (`catalog`)."""
