@@ -74,6 +74,7 @@ def minigrid_spaces(options: Mapping[str, object]) -> Spaces:
     )
 
 
+SIMULATOR_BEHAVIORS: dict[str, tuple[str, ...]] = {"minigrid": ("balanced", "expert", "mixture", "random")}
 SIMULATOR_SPACES: dict[str, Callable[[Mapping[str, object]], Spaces]] = {"minigrid": minigrid_spaces}
 
 

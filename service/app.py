@@ -12,8 +12,9 @@ from service.api.dependencies import Services, utc_now
 from service.carrier import Relay
 from service.dashboard import page
 from service.settings import Settings
-from service.store.blobs import Blobs, ProvenanceBlobs
+from service.store.blobs import Blobs
 from service.store.database import migrate, open_database
+from service.store.provenance import open_provenance
 
 
 def create_app(settings: Settings | None = None, clock: Callable[[], datetime] = utc_now) -> FastAPI:
@@ -40,12 +41,11 @@ def open_services(settings: Settings, clock: Callable[[], datetime] = utc_now) -
     if settings.embedded:
         settings.data_folder.mkdir(parents=True, exist_ok=True)
         migrate(url)
-    provenance = settings.resolved_provenance_url()
     return Services(
         settings=settings,
         database=open_database(url),
         blobs=Blobs(settings.resolved_blobs_url()),
-        provenance=ProvenanceBlobs(provenance) if provenance else None,
+        provenance=open_provenance(settings),
         clock=clock,
     )
 

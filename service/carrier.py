@@ -13,7 +13,7 @@ from kombu.exceptions import OperationalError
 from sqlalchemy.exc import SQLAlchemyError
 
 from api_schemas.jobs import RUN_JOB
-from service import jobs
+from service import reaper
 from service.log import get_logger
 from service.settings import Settings
 from service.store.database import Database
@@ -78,7 +78,7 @@ class Relay:
         while not self._stop.wait(self._settings.poll_seconds):
             try:
                 with self._database.write() as session:
-                    jobs.reap(session, self._clock())
+                    reaper.reap(session, self._clock())
                 relay(self._database, app, self._settings.celery_prefix, self._clock())
             except (SQLAlchemyError, OperationalError) as error:
                 log.warning("relay_failed", error=str(error))

@@ -53,6 +53,10 @@ class UnknownStrategy(InvalidField):
     """No strategy has this name."""
 
 
+class UnknownBehavior(InvalidField):
+    """The simulator has no behavior of this name."""
+
+
 class InvalidLabel(InvalidField):
     """A label does not fit its segment or the project's action space."""
 

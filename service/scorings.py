@@ -11,6 +11,7 @@ from api_schemas.jobs import MergeScores, ScoreShard, SelectQueue, TrainRound
 from api_schemas.strategies import CATALOG, COLD_START_STRATEGY
 from service import jobs
 from service.errors import UnknownResource
+from service.settings import Settings
 from service.store.queries import acquisitions as queries
 from service.store.queries import jobs as job_queries
 from service.store.queries import pool as pool_queries
@@ -27,6 +28,11 @@ class Limits:
     queue_length: int
     shard_segments: int
     max_attempts: int = 5
+
+
+def limits_of(settings: Settings) -> Limits:
+    """The bounds that the settings give."""
+    return Limits(settings.queue_length, settings.shard_transitions, settings.job_max_attempts)
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,11 @@ from sqlalchemy.orm import Session
 from api_schemas.keys import Scope
 from service import keys
 from service.errors import NotAllowed, Unauthenticated
-from service.scorings import Limits
+from service.scorings import Limits, limits_of
 from service.settings import Settings
-from service.store.blobs import Blobs, ProvenanceBlobs
+from service.store.blobs import Blobs
 from service.store.database import Database
+from service.store.provenance import ProvenanceBlobs
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,7 @@ class Services:
     @property
     def limits(self) -> Limits:
         """Bounds of scorings."""
-        settings = self.settings
-        return Limits(settings.queue_length, settings.shard_transitions, settings.job_max_attempts)
+        return limits_of(self.settings)
 
 
 def utc_now() -> datetime:

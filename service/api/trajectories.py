@@ -8,11 +8,11 @@ from sqlalchemy import select
 
 from api_schemas.base import Page
 from api_schemas.collections import CollectionCreate
-from api_schemas.jobs import Collect, Job
+from api_schemas.jobs import Job
 from api_schemas.trajectories import SplitChoice, TrajectoriesAdded, Trajectory
-from service import jobs, pool, projects
+from service import collections, jobs, pool, projects
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession, requires
-from service.errors import InvalidField, NoProvenance, NoSimulator
+from service.errors import InvalidField, NoProvenance
 from service.store import codec, npz
 from service.store.queries import labels as label_queries
 from service.store.queries import pool as pool_queries
@@ -90,11 +90,7 @@ def trajectory_provenance(
 
 @router.post("/collections", status_code=202, dependencies=[admin])
 def collect(request: CollectionCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Job:
-    project = projects.find(session, request.project)
-    if projects.environment_of(project).simulator is None:
-        raise NoSimulator(project.id)
-    payload = Collect(collection=request)
-    row = jobs.enqueue(session, project.id, payload, project.id, now, held.settings.job_max_attempts)
+    row = collections.request(session, request, now, held.settings.job_max_attempts)
     response.headers["Location"] = f"/jobs/{row.id}"
     return jobs.describe(row)
 

@@ -1,19 +1,16 @@
 """Blobs by content hash, on a folder or an S3-compatible store through obstore.
 
-Two stores exist and nothing joins them: observations, weights and scores in one, simulator states and behavior
-provenance in another with its own root, which training and scoring processes are not given.
+This store holds observations, weights, scores and checkpoints. What may not be seen in training is in another, with a
+root of its own: service.store.provenance.
 """
 
 import hashlib
 from pathlib import Path
-from typing import Literal
 
 from obstore.exceptions import AlreadyExistsError
 from obstore.store import LocalStore, MemoryStore, S3Store, from_url
 
 from service.errors import CorruptBlob, MissingBlob
-
-BlobKind = Literal["trajectories", "weights", "scores", "checkpoints"]
 
 
 class Blobs:
@@ -61,12 +58,6 @@ class Blobs:
         if kind not in self.kinds:
             raise ValueError(f"kind: {kind!r} is not one of {self.kinds}")
         return f"{kind}/{sha256[:2]}/{sha256}"
-
-
-class ProvenanceBlobs(Blobs):
-    """Simulator states and behavior provenance. Only labelers and collectors are given one."""
-
-    kinds = ("provenance",)
 
 
 def _open_store(url: str) -> LocalStore | S3Store | MemoryStore:

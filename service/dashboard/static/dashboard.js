@@ -22,14 +22,17 @@ function choice() {
 
 const addressOf = (project, compare) => `#project=${encodeURIComponent(project)}${compare.length ? `&compare=${compare.map(encodeURIComponent).join(",")}` : ""}`;
 
-/** New events come after the last cursor; those before it are remembered. */
+/** Events come oldest first: large pages up to the newest, then small ones from the last cursor on. */
 async function askEvents(project, signal) {
-  if (state.events?.project !== project) state.events = { project, cursor: null, byId: new Map() };
+  if (state.events?.project !== project) state.events = { project, cursor: null, limit: 1000, byId: new Map() };
   const seen = state.events;
   for (let page = 0; page < 20; page += 1) {
-    const answer = await get("events", { project, cursor: seen.cursor, limit: 1000 }, signal);
+    const answer = await get("events", { project, cursor: seen.cursor, limit: seen.limit }, signal);
     for (const event of answer.items) seen.byId.set(event.id, event);
-    if (!answer.next || answer.next === seen.cursor) break;
+    if (!answer.next) {
+      seen.limit = SHOWN.events;
+      break;
+    }
     seen.cursor = answer.next;
   }
   const newest = [...seen.byId.values()].sort((a, b) => b.id - a.id).slice(0, SHOWN.events);
@@ -43,13 +46,12 @@ async function askProject(signal) {
   const [about, own, rounds, jobs, events, ...others] = await Promise.all([
     get(`projects/${encodeURIComponent(project)}`, {}, signal),
     curve(project),
-    list("rounds", { project }, signal),
+    get("rounds", { project, limit: SHOWN.rounds }, signal),
     get("jobs", { project, limit: SHOWN.jobs }, signal),
     askEvents(project, signal),
     ...compare.map((id) => curve(id).catch((error) => { if (error instanceof Refused) return { project: id, points: [] }; throw error; })),
   ]);
-  rounds.sort((a, b) => b.number - a.number);
-  return { about, own, others, rounds: rounds.slice(0, SHOWN.rounds), jobs: jobs.items, events };
+  return { about, own, others, rounds: rounds.items, jobs: jobs.items, events };
 }
 
 async function ask(signal) {

@@ -31,7 +31,7 @@ export function redraw(container, data, draw) {
 const COUNT = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 export const count = (value) => COUNT.format(value);
 export const plural = (value, noun) => `${count(value)} ${noun}${value === 1 ? "" : "s"}`;
-export const words = (name) => String(name).replaceAll("_", " ");
+export const words = (name) => String(name).replaceAll(/[._]/g, " ");
 export const percent = (value) => (value == null ? "–" : `${(100 * value).toFixed(1)} %`);
 export const digits = (value) => (value == null ? "–" : value >= 100 ? count(value) : value.toPrecision(3));
 export const figure = (value) => (value == null ? "–" : value >= 100 ? count(value) : Number(value.toPrecision(3)).toString());

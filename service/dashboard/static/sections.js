@@ -32,7 +32,7 @@ export function drawRound(project, rounds, jobs) {
   const latest = rounds[0];
   const news = latest && latest.id !== current?.id && [...WORKING, "failed"].includes(latest.status) ? latest : null;
   const job = news && jobs.find((each) => each.id === news.job);
-  redraw(byId("round"), [current, news, job?.state, job?.progress, job?.message, project.policy.round_labels], () => {
+  redraw(byId("round"), [current, news, job?.state, job?.progress, job?.message, project.policy.round_labels, project.counts.labeled > 0], () => {
     if (!latest) return firstRound(project);
     return [
       current ? currentRound(current) : empty("No round is current yet."),
@@ -42,8 +42,10 @@ export function drawRound(project, rounds, jobs) {
 }
 
 function firstRound(project) {
-  const own = project.policy.round_labels ? ` or add labels: one starts by itself every ${count(project.policy.round_labels)} new pool labels.` : ".";
-  return empty("No round yet. Start one with ", code("POST /rounds"), own);
+  const every = project.policy.round_labels;
+  const own = every ? ` A round starts by itself every ${count(every)} new pool labels.` : "";
+  if (!project.counts.labeled) return empty("No round yet. Take segments with ", code("POST /acquire"), " and label them with ", code("POST /labels"), ".", own);
+  return empty("No round yet. Start one with ", code("POST /rounds"), ".", own);
 }
 
 function currentRound(round) {
@@ -102,6 +104,7 @@ export function curveAdvice(project, rounds) {
   const { counts } = project;
   if (rounds.some((round) => WORKING.includes(round.status)) && counts.held_out_labeled) return "No model error yet: the first point appears when the round has been evaluated.";
   if (!counts.held_out_labeled) return "No model error yet: upload held-out labels, then start a round.";
+  if (!counts.labeled) return "No model error yet: label segments of the pool, then start a round.";
   return "No model error yet: start a round, or add labels until one starts by itself.";
 }
 
@@ -129,7 +132,7 @@ function table(heads, rows, caption) {
 
 /** Rounds, newest first. */
 export function drawRounds(rounds, project) {
-  redraw(byId("rounds"), [rounds, project.policy.round_labels], () => {
+  redraw(byId("rounds"), [rounds, project.policy.round_labels, project.counts.labeled > 0], () => {
     if (!rounds.length) return firstRound(project);
     const row = (round) => [
       round.number, h("span", {}, badge(round.status), round.error ? h("span", { class: "error" }, ` ${round.error}`) : null),

@@ -1,0 +1,41 @@
+"""The command line. Nothing heavy is imported before a command runs: every --help answers at once."""
+
+import sys
+
+import typer
+
+from asim.commands import labeling, processes, projects
+from asim.commands.console import explain
+
+app = typer.Typer(
+    name="asim",
+    help="Find the few action-free segments whose labels help a robot world model most.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+app.command("serve")(processes.serve)
+app.command("worker")(processes.worker)
+app.command("demo")(processes.demo)
+app.add_typer(projects.app, name="project", help="Create, list, show and change projects.")
+app.command("collect")(projects.collect)
+app.command("import")(projects.import_files)
+app.command("acquire")(labeling.acquire)
+app.command("label")(labeling.label)
+app.command("round")(labeling.start_round)
+app.command("error")(labeling.model_error)
+
+
+def main() -> None:
+    """Run one command; what goes wrong is one sentence on stderr and exit status 1."""
+    try:
+        app()
+    except Exception as error:
+        sentence = explain(error)
+        if sentence is None:
+            raise
+        typer.echo(f"asim: {sentence}", err=True)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

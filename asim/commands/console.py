@@ -1,0 +1,43 @@
+"""What the commands share: options, the client, sentences for errors."""
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from asim.errors import AsimError
+
+if TYPE_CHECKING:
+    from asim.client import Client
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+Url = Annotated[str, typer.Option("--url", envvar="ASIM_URL", help="Where the service listens.")]
+Key = Annotated[str | None, typer.Option("--key", envvar="ASIM_KEY", help="API key; embedded mode needs none.")]
+ProjectName = Annotated[str, typer.Argument(metavar="PROJECT", help="Name or id of the project.")]
+Strategy = Annotated[str | None, typer.Option(help="random, cycle, vanilla_cycle or uncertainty.")]
+Purpose = Annotated[Literal["pool", "held_out"], typer.Option(help="Label the pool, or the held-out set.")]
+Split = Annotated[
+    Literal["auto", "pool", "held_out"], typer.Option(help="Where the trajectories go; auto decides by content hash.")
+]
+Count = Annotated[int, typer.Option(min=1, help="Segments.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the service's answer as JSON.")]
+
+
+def connect(url: str, key: str | None) -> "Client":
+    """A client of the service at `url`."""
+    from asim.client import Client
+
+    return Client(url, key)
+
+
+def explain(error: Exception) -> str | None:
+    """One sentence for a person, or None where the error is a defect of ours and its traceback is needed."""
+    if isinstance(error, AsimError):
+        return str(error)
+    from pydantic import ValidationError
+
+    if isinstance(error, ValidationError):
+        fields = (f"{'.'.join(map(str, each['loc'])) or 'request'}: {each['msg']}" for each in error.errors())
+        return "; ".join(fields)
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return None

@@ -1,0 +1,111 @@
+"""asim acquire, asim label, asim round, asim error: the loop by hand."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from asim.commands.console import DEFAULT_URL, Count, Json, Key, ProjectName, Purpose, Strategy, Url, connect
+
+Wait = Annotated[float, typer.Option(min=0, help="Seconds to wait for a ranked queue.")]
+
+
+def acquire(
+    project: ProjectName,
+    *,
+    count: Count = 16,
+    strategy: Strategy = None,
+    purpose: Purpose = "pool",
+    lease_seconds: Annotated[float | None, typer.Option(help="Default: the project's.")] = None,
+    labeler: Annotated[str, typer.Option(help="Who will answer.")] = "",
+    wait: Wait = 600.0,
+    as_json: Json = False,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Take a batch of segments to label, under a lease."""
+    from asim.tables import acquisition_table, show
+
+    with connect(url, key) as client:
+        found = client.find_project(project)
+        batch = client.acquire(
+            found.id,
+            count,
+            strategy=strategy,
+            purpose=purpose,
+            lease_seconds=lease_seconds,
+            labeler=labeler,
+            wait=wait,
+        )
+    if as_json:
+        typer.echo(batch.model_dump_json(indent=2))
+        return
+    show(acquisition_table(batch))
+    typer.echo(f"acquisition {batch.id}, token {batch.token}: {len(batch.items)} segments by {batch.strategy}")
+    typer.echo(f"labels are due by {batch.lease_expires_at:%Y-%m-%d %H:%M:%S %Z} through POST {url}/labels")
+
+
+def label(
+    project: ProjectName,
+    *,
+    count: Count = 100,
+    strategy: Strategy = None,
+    purpose: Purpose = "pool",
+    acquisition: Annotated[str | None, typer.Option(help="Answer this one, taken elsewhere; needs --token.")] = None,
+    token: Annotated[int | None, typer.Option(help="Of --acquisition.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draw among actions that explain a step alike.")] = 0,
+    wait: Wait = 600.0,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Acquire segments and answer them with the project's simulator."""
+    from asim.report import Report
+    from asim.simulator_labeling import answer, given, taken
+
+    with connect(url, key) as client, Report() as report:
+        found = client.find_project(project)
+        if acquisition is not None:
+            batches = given(client, found, acquisition, token)
+        else:
+            batches = taken(client, found, count, strategy, purpose, wait)
+        answer(client, batches, seed, report)
+
+
+def start_round(project: ProjectName, url: Url = DEFAULT_URL, key: Key = None) -> None:
+    """Retrain on all labels that are there now; wait until the round is current."""
+    from asim.report import Report
+    from asim.rounds import await_round
+    from asim.tables import error_table, show
+
+    with connect(url, key) as client, Report() as report:
+        found = client.find_project(project)
+        started = client.start_round(found.id)
+        with report.step(f"round {started.number} of {found.name} on {started.labels} labels") as advance:
+            await_round(client, started.id, advance)
+        curve = client.model_error(found.id)
+    show(error_table({found.name: curve}))
+
+
+def model_error(
+    projects: Annotated[list[str], typer.Argument(metavar="PROJECT...", help="Names or ids.")],
+    plot: Annotated[Path | None, typer.Option(help="Write the learning curves to this PNG file.")] = None,
+    as_json: Json = False,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """The learning curves of projects: model error on held-out data after each round."""
+    from asim.tables import error_table, show
+
+    with connect(url, key) as client:
+        found = [client.find_project(name) for name in projects]
+        curves = {project.name: client.model_error(project.id) for project in found}
+    if as_json:
+        for curve in curves.values():
+            typer.echo(curve.model_dump_json())
+    else:
+        show(error_table(curves))
+    if plot is not None:
+        from asim.figure import draw_learning_curves
+
+        draw_learning_curves(curves, plot)
+        typer.echo(f"wrote {plot}", err=True)

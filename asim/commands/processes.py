@@ -1,0 +1,58 @@
+"""asim serve, asim worker, asim demo: the commands that start processes."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from service.settings import Settings
+
+Data = Annotated[
+    Path | None,
+    typer.Option("--data", envvar="ASIM_DATA_FOLDER", help="Folder that holds everything; default asim-data."),
+]
+
+
+def serve(
+    data: Data = None,
+    host: Annotated[str, typer.Option(help="Loopback address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free port.")] = 8000,
+    runners: Annotated[int, typer.Option(min=1, help="Processes that train and score.")] = 1,
+) -> None:
+    """Serve the API and the dashboard, with the runners that do the jobs, until Ctrl-C."""
+    from asim.serve import serve as serve_until_signal
+
+    serve_until_signal(_settings(data), host, port, runners, tell=_tell)
+
+
+def worker(
+    data: Data = None,
+    queues: Annotated[
+        str, typer.Option(help="Comma-separated, of train, score, default; or label alone.")
+    ] = "train,score,default",
+) -> None:
+    """Do jobs in this process: as a Celery worker where ASIM_BROKER_URL is set, else on the data folder's database."""
+    from asim.worker import work
+
+    work(_settings(data), queues)
+
+
+def demo(
+    seed: Annotated[int, typer.Option(min=0, envvar="SEED", help="Of data, labels and networks.")] = 0,
+    keep: Annotated[Path | None, typer.Option(help="Keep the service's data in this folder.")] = None,
+) -> None:
+    """Run the loop on MiniGrid with strategies cycle and random side by side, and compare their model errors."""
+    from asim.demo import demo as run_demo
+
+    run_demo(seed, keep)
+
+
+def _settings(data: Path | None) -> "Settings":
+    from service.settings import Settings
+
+    return Settings() if data is None else Settings(data_folder=data)
+
+
+def _tell(line: str) -> None:
+    typer.echo(line)

@@ -1,0 +1,188 @@
+"""asim project, asim collect, asim import: what is known of an environment, and its trajectories."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from asim.commands.console import DEFAULT_URL, Key, ProjectName, Split, Strategy, Url, connect
+from asim.errors import AsimError
+
+if TYPE_CHECKING:
+    from api_schemas.environments import Environment
+
+UPLOAD_BYTES = 32 * 2**20  # of one request, so that no upload meets the service's limit
+app = typer.Typer(no_args_is_help=True)
+RoundLabels = Annotated[int | None, typer.Option(min=0, help="New pool labels that start a round; 0: none does.")]
+LabelBudget = Annotated[int | None, typer.Option(min=1, help="Pool labels that may be spent in all.")]
+
+
+@app.command("create")
+def create(
+    name: str,
+    *,
+    simulator: Annotated[str | None, typer.Option(help="A simulator that we ship: minigrid.")] = None,
+    option: Annotated[list[str] | None, typer.Option(help="Of the simulator, as name=value; repeatable.")] = None,
+    spaces: Annotated[Path | None, typer.Option(help="JSON file with the spaces of your own environment.")] = None,
+    strategy: Strategy = None,
+    round_labels: RoundLabels = None,
+    label_budget: LabelBudget = None,
+    segment_length: Annotated[int, typer.Option(min=1, help="Transitions of a segment.")] = 1,
+    stride: Annotated[int | None, typer.Option(help="Between segments; default the segment's length.")] = None,
+    held_out_fraction: Annotated[float, typer.Option(help="Of trajectories that never train.")] = 0.1,
+    seed: Annotated[int, typer.Option(help="Of all its random draws.")] = 0,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Create a project and print its id."""
+    from api_schemas.projects import LabelingPolicy, ProjectCreate
+
+    policy = {"strategy": strategy, "round_labels": round_labels, "label_budget": label_budget}
+    project = ProjectCreate(
+        name=name,
+        environment=_environment(simulator, option or [], spaces),
+        segment_length=segment_length,
+        stride=stride,
+        held_out_fraction=held_out_fraction,
+        seed=seed,
+        policy=LabelingPolicy.model_validate({field: value for field, value in policy.items() if value is not None}),
+    )
+    with connect(url, key) as client:
+        typer.echo(client.create_project(project).id)
+
+
+@app.command("list")
+def list_projects(url: Url = DEFAULT_URL, key: Key = None) -> None:
+    """All projects."""
+    from asim.tables import project_table, show
+
+    with connect(url, key) as client:
+        show(project_table(list(client.projects())))
+
+
+@app.command("show")
+def show_project(project: ProjectName, url: Url = DEFAULT_URL, key: Key = None) -> None:
+    """One project as it stands, as JSON."""
+    with connect(url, key) as client:
+        typer.echo(client.find_project(project).model_dump_json(indent=2))
+
+
+@app.command("set")
+def change(
+    project: ProjectName,
+    *,
+    strategy: Strategy = None,
+    diversify: Annotated[bool | None, typer.Option(help="Rank so that every prefix is a diverse batch.")] = None,
+    round_labels: RoundLabels = None,
+    label_budget: LabelBudget = None,
+    lease_seconds: Annotated[float | None, typer.Option(help="Of a batch, unless it is asked otherwise.")] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Change the labeling policy; what is left out stays."""
+    from api_schemas.projects import ProjectPatch
+
+    given = {
+        "strategy": strategy,
+        "diversify": diversify,
+        "round_labels": round_labels,
+        "label_budget": label_budget,
+        "lease_seconds": lease_seconds,
+    }
+    patch = ProjectPatch.model_validate({field: value for field, value in given.items() if value is not None})
+    with connect(url, key) as client:
+        changed = client.change_project(client.find_project(project).id, patch)
+    typer.echo(changed.policy.model_dump_json(indent=2))
+
+
+def collect(
+    project: ProjectName,
+    *,
+    transitions: Annotated[int, typer.Option(min=1, help="Transitions to collect.")],
+    behavior: Annotated[str, typer.Option(help="mixture, random, balanced, or a solver's name.")] = "mixture",
+    seed: Annotated[int, typer.Option(min=0, help="Of layouts and actions.")] = 0,
+    split: Split = "auto",
+    labels_per_action: Annotated[
+        int | None, typer.Option(min=1, help="Record the labels of so many effective transitions of each action.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Run a behavior in the project's simulator and add its trajectories; wait until they are there."""
+    from api_schemas.collections import CollectionCreate, CollectionLabels
+    from asim.report import Report
+
+    labels = None if labels_per_action is None else CollectionLabels(per_action=labels_per_action)
+    with connect(url, key) as client, Report() as report, report.step(f"collect into {project}") as advance:
+        collection = CollectionCreate(
+            project=client.find_project(project).id,
+            behavior=behavior,
+            transitions=transitions,
+            seed=seed,
+            split=split,
+            labels=labels,
+        )
+        job = client.collect(collection)
+        done = client.wait_for_job(job.id, progress=lambda seen: advance(seen.progress, seen.message))
+    typer.echo(json.dumps(done.result))
+
+
+def import_files(
+    project: ProjectName,
+    files: Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="npz files, one a trajectory.")],
+    split: Split = "auto",
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Add recorded trajectories.
+
+    An npz file holds one array for each observation stream of the project, time first, T + 1 rows. With a further
+    array `actions` of T rows it is a labeled trajectory: all its segments are labeled at once.
+    """
+    from asim.importing import add_labeled, has_actions
+
+    with connect(url, key) as client:
+        found = client.find_project(project)
+        labeled = [path for path in files if has_actions(path)]
+        plain = [path for path in files if path not in set(labeled)]
+        for batch in _batches(plain):
+            for receipt in client.add_files(found.id, {str(path): path.read_bytes() for path in batch}, split).items:
+                place = f"{receipt.split}, {receipt.transitions} transitions"
+                typer.echo(f"{receipt.source}: {receipt.status} {receipt.id} ({place})")
+        for batch in _batches(labeled):
+            accepted = add_labeled(client, found.id, batch, split)
+            typer.echo(f"{len(batch)} labeled files: {accepted.created} labels, {accepted.duplicates} known before")
+
+
+def _environment(simulator: str | None, options: list[str], spaces: Path | None) -> "Environment":
+    from api_schemas.environments import Environment, Spaces
+
+    known = None if spaces is None else Spaces.model_validate_json(spaces.read_bytes())
+    return Environment(simulator=simulator, options=dict(map(_option, options)), spaces=known)
+
+
+def _option(text: str) -> tuple[str, str | int | float | bool]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise AsimError(f"option {text!r} is not of the form name=value")
+    try:
+        parsed = json.loads(value)
+    except ValueError:  # a plain word, such as key_delivery
+        return name, value
+    return name, parsed if isinstance(parsed, int | float | bool) else value
+
+
+def _batches(paths: list[Path]) -> Iterator[list[Path]]:
+    """Groups of files that one request carries."""
+    batch: list[Path] = []
+    size = 0
+    for path in paths:
+        if batch and (size + path.stat().st_size > UPLOAD_BYTES or len(batch) == 200):
+            yield batch
+            batch, size = [], 0
+        batch.append(path)
+        size += path.stat().st_size
+    if batch:
+        yield batch

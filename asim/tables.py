@@ -1,0 +1,68 @@
+"""The service's answers as tables for a terminal."""
+
+from collections.abc import Mapping, Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from api_schemas.acquisitions import Acquisition
+from api_schemas.projects import Project
+from api_schemas.rounds import ModelError, ModelErrorCurve
+
+WIDTH_WITHOUT_TERMINAL = 110
+
+
+def show(table: Table) -> None:
+    """Print it; without a terminal, wide enough for a log."""
+    console = Console()
+    (console if console.is_terminal else Console(width=WIDTH_WITHOUT_TERMINAL)).print(table)
+
+
+def project_table(projects: Sequence[Project]) -> Table:
+    """One row a project."""
+    table = _table("project", "id", "environment", "strategy", "pool", "labeled", "held-out labeled", "budget left")
+    for project in projects:
+        counts, left = project.counts, project.budget.remaining
+        environment = project.environment.simulator or "own spaces"
+        budget = "no limit" if left is None else str(left)
+        numbers = [str(counts.pool_segments), str(counts.labeled), str(counts.held_out_labeled), budget]
+        table.add_row(project.name, str(project.id), environment, project.policy.strategy, *numbers)
+    return table
+
+
+def acquisition_table(acquisition: Acquisition) -> Table:
+    """One row a segment, best first."""
+    table = _table("rank", "trajectory", "start", "length", "score")
+    for item in acquisition.items:
+        score = "" if item.score is None else f"{item.score:.4f}"
+        table.add_row(str(item.rank), item.trajectory, str(item.start), str(item.length), score)
+    return table
+
+
+def error_table(curves: Mapping[str, ModelErrorCurve], first_column: str = "project") -> Table:
+    """One row a round: loss in nats a transition, Dynamics Accuracy overall and by action group."""
+    groups = sorted(
+        {group for curve in curves.values() for point in curve.points for group in point.model_error.by_group}
+    )
+    accuracies = ["Dynamics Accuracy", *reversed(groups)]
+    table = _table(first_column, "labels", "test loss", *accuracies)
+    for name, curve in curves.items():
+        for point in curve.points:
+            last = point is curve.points[-1]
+            table.add_row(name, str(point.labels), *_error_cells(point.model_error, accuracies[1:]), end_section=last)
+    return table
+
+
+def _error_cells(error: ModelError, groups: Sequence[str]) -> list[str]:
+    loss = "" if error.loss is None else f"{error.loss:.4f}"
+    by_group = [error.by_group[group].dynamics_accuracy if group in error.by_group else None for group in groups]
+    return [loss, *("" if share is None else f"{share:.1%}" for share in (error.dynamics_accuracy, *by_group))]
+
+
+def _table(first: str, *others: str) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column(first, overflow="fold")
+    for name in others:
+        text = name in ("id", "trajectory", "environment", "strategy")
+        table.add_column(name, justify="left" if text else "right", overflow="fold")
+    return table

@@ -1,0 +1,123 @@
+"""Model error: how well a world model predicts labeled segments and inverse dynamics recovers their actions."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from models.inverse_dynamics.base import InverseDynamics
+from models.segments import SegmentBatch, at, first, future
+from models.world_models.base import WorldModel
+
+
+@dataclass(frozen=True)
+class GroupError:
+    """Error over some transitions; None where there is nothing to average over.
+
+    next_state_loss: distance of one-step predictions, mean over transitions (grid: nats summed over the observation).
+    dynamics_accuracy: changed elements predicted right / changed elements, pooled over transitions.
+    inverse_accuracy: share of transitions whose inferred action is in the label's action set.
+    """
+
+    transitions: int
+    next_state_loss: float | None
+    dynamics_accuracy: float | None
+    inverse_accuracy: float | None
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """Error over all transitions, and over those whose labeled action is in a group."""
+
+    overall: GroupError
+    groups: dict[str, GroupError]
+
+
+@dataclass(frozen=True)
+class TransitionErrors:
+    """Per transition (N,): distance, changed elements predicted right, changed elements, inferred action right."""
+
+    distance: Tensor
+    correct: Tensor
+    changed: Tensor
+    inverse_correct: Tensor | None
+
+    def group(self, members: Tensor) -> GroupError:
+        """The error of the transitions where `members` (N,) is true."""
+        count = int(members.sum())
+        changed = int(self.changed[members].sum())
+        inverse = self.inverse_correct
+        return GroupError(
+            transitions=count,
+            next_state_loss=float(self.distance[members].double().mean()) if count else None,
+            dynamics_accuracy=int(self.correct[members].sum()) / changed if changed else None,
+            inverse_accuracy=float(inverse[members].double().mean()) if count and inverse is not None else None,
+        )
+
+
+def evaluate(
+    world_model: WorldModel,
+    batch: SegmentBatch,
+    groups: Mapping[str, set[int]],
+    inverse_dynamics: InverseDynamics | None = None,
+    chunk: int = 512,
+) -> ModelError:
+    """One-step errors over all transitions of labeled segments (on the models' device).
+
+    groups: name -> discrete actions, e.g. {"movement": {0, 1, 2}}. Raises ValueError for a batch without actions.
+    """
+    if batch.actions is None:
+        raise ValueError("Evaluation needs labeled segments; the batch carries no actions.")
+    errors = transition_errors(world_model, batch, inverse_dynamics, chunk)
+    actions = batch.transitions().actions
+    everything = torch.ones(len(errors.distance), dtype=torch.bool, device=errors.distance.device)
+    return ModelError(
+        overall=errors.group(everything),
+        groups={name: errors.group(_in(actions, members)) for name, members in groups.items()},
+    )
+
+
+@torch.inference_mode()
+def transition_errors(
+    world_model: WorldModel, batch: SegmentBatch, inverse_dynamics: InverseDynamics | None = None, chunk: int = 512
+) -> TransitionErrors:
+    """The parts of the model error of every transition, in the order of `batch.transitions()`."""
+    pairs = batch.transitions()
+    parts = [
+        _errors(world_model, pairs.take(slice(start, start + chunk)), inverse_dynamics)
+        for start in range(0, pairs.size, chunk)
+    ]
+    inverse = [part.inverse_correct for part in parts if part.inverse_correct is not None]
+    return TransitionErrors(
+        distance=torch.cat([part.distance for part in parts]),
+        correct=torch.cat([part.correct for part in parts]),
+        changed=torch.cat([part.changed for part in parts]),
+        inverse_correct=torch.cat(inverse) if inverse else None,
+    )
+
+
+def _errors(world_model: WorldModel, pairs: SegmentBatch, inverse_dynamics: InverseDynamics | None) -> TransitionErrors:
+    actions: Any = pairs.actions
+    prediction = world_model.rollout(world_model.infer_state(first(pairs.observations)), actions)
+    correct, changed = world_model.changes(at({"state": prediction}, 0)["state"], pairs.observations)
+    return TransitionErrors(
+        distance=world_model.distance(prediction, future(pairs.observations)),
+        correct=correct,
+        changed=changed,
+        inverse_correct=None if inverse_dynamics is None else _recovered(inverse_dynamics, pairs),
+    )
+
+
+def _recovered(inverse_dynamics: InverseDynamics, pairs: SegmentBatch) -> Tensor:
+    inferred = inverse_dynamics.infer(pairs.observations)[:, 0]
+    if pairs.action_sets is not None:
+        return pairs.action_sets[:, 0].gather(1, inferred.unsqueeze(1)).squeeze(1)
+    actions: Any = pairs.actions
+    return torch.eq(inferred, actions[:, 0])
+
+
+def _in(actions: Tensor | None, members: set[int]) -> Tensor:
+    assert actions is not None  # noqa: S101  # evaluate refuses a batch without actions
+    return torch.isin(actions[:, 0], torch.tensor(sorted(members), device=actions.device))

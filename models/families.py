@@ -1,0 +1,152 @@
+"""Which world model, inverse dynamics and subgoal generator belong together, and how each is trained by default."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import torch
+
+from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.inverse_dynamics.grid import (
+    DenseInverseDynamicsConfig,
+    GridDenseInverseDynamics,
+    GridSparseInverseDynamics,
+    SparseInverseDynamicsConfig,
+)
+from models.network import KINDS, Network
+from models.spaces import BoxAction, DiscreteAction, Spaces, StreamSpec
+from models.subgoal_generators.base import SubgoalGenerator
+from models.subgoal_generators.grid import GridSubgoalGenerator, GridSubgoalGeneratorConfig
+from models.training import TrainingConfig
+from models.world_models.base import WorldModel
+from models.world_models.grid import GridWorldModel, GridWorldModelConfig
+
+__all__ = [
+    "FAMILIES",
+    "GRID",
+    "BoxAction",
+    "DiscreteAction",
+    "Family",
+    "GridFamily",
+    "Spaces",
+    "StreamSpec",
+    "family_named",
+]
+
+
+class Family(Protocol):
+    """Builds the networks of one kind of environment. A config of None is the family's default."""
+
+    @property
+    def name(self) -> str: ...
+
+    def check_spaces(self, spaces: Spaces) -> None:
+        """Raises ValueError, in a sentence, for spaces the family cannot take."""
+        ...
+
+    def build_world_model(self, spaces: Spaces, config: Any, generator: torch.Generator) -> WorldModel: ...
+
+    def build_inverse_dynamics(
+        self, spaces: Spaces, kind: Literal["sparse", "dense"], config: Any, generator: torch.Generator
+    ) -> DiscreteInverseDynamics: ...
+
+    def build_subgoal_generator(self, spaces: Spaces, config: Any, generator: torch.Generator) -> SubgoalGenerator: ...
+
+    def build(self, kind: str, spaces: Spaces, config: Mapping[str, Any], generator: torch.Generator) -> Network:
+        """The network of `kind` (one of KINDS) from its config as JSON. Raises ValueError for another kind."""
+        ...
+
+    def training_config(self, kind: str, segments: int) -> TrainingConfig:
+        """The default schedule for `kind` on that many segments. Raises ValueError for an unknown kind."""
+        ...
+
+
+@dataclass(frozen=True)
+class GridFamily:
+    """Grid worlds in MiniGrid's observation code: streams `grid` (S, S, 3) and `carried` (3,), discrete actions."""
+
+    name: str = "grid"
+
+    def check_spaces(self, spaces: Spaces) -> None:
+        """Raises ValueError, in a sentence, for spaces other than the family's."""
+        streams = spaces.observations
+        if set(streams) != {"grid", "carried"}:
+            raise ValueError(f"The grid family takes the streams 'grid' and 'carried', got {sorted(streams)}.")
+        shape = streams["grid"].shape
+        if len(shape) != 3 or shape[0] != shape[1] or shape[0] < 3 or shape[2] != 3:
+            raise ValueError(f"grid must have shape (S, S, 3) with S of at least 3, got {shape}.")
+        if streams["carried"].shape != (3,):
+            raise ValueError(f"carried must have shape (3,), got {streams['carried'].shape}.")
+        for name, stream in streams.items():
+            if stream.dtype != "uint8":
+                raise ValueError(f"{name} must be uint8, got {stream.dtype}.")
+        if not isinstance(spaces.action, DiscreteAction) or spaces.action.n < 2:
+            raise ValueError(f"The grid family takes a discrete action space of at least 2, got {spaces.action}.")
+
+    def build_world_model(
+        self, spaces: Spaces, config: GridWorldModelConfig | None, generator: torch.Generator
+    ) -> GridWorldModel:
+        """All parameters are drawn from `generator`."""
+        self.check_spaces(spaces)
+        return GridWorldModel(spaces, config or GridWorldModelConfig(), generator)
+
+    def build_inverse_dynamics(
+        self,
+        spaces: Spaces,
+        kind: Literal["sparse", "dense"],
+        config: SparseInverseDynamicsConfig | DenseInverseDynamicsConfig | None,
+        generator: torch.Generator,
+    ) -> DiscreteInverseDynamics:
+        """All parameters are drawn from `generator`. Raises ValueError for a kind or config that does not fit."""
+        self.check_spaces(spaces)
+        if kind == "sparse" and isinstance(config, SparseInverseDynamicsConfig | None):
+            return GridSparseInverseDynamics(spaces, config or SparseInverseDynamicsConfig(), generator)
+        if kind == "dense" and isinstance(config, DenseInverseDynamicsConfig | None):
+            return GridDenseInverseDynamics(spaces, config or DenseInverseDynamicsConfig(), generator)
+        raise ValueError(f"Grid inverse dynamics is 'sparse' or 'dense' with its config, got {kind!r} and {config}.")
+
+    def build_subgoal_generator(
+        self, spaces: Spaces, config: GridSubgoalGeneratorConfig | None, generator: torch.Generator
+    ) -> GridSubgoalGenerator:
+        """All parameters are drawn from `generator`."""
+        self.check_spaces(spaces)
+        return GridSubgoalGenerator(spaces, config or GridSubgoalGeneratorConfig(), generator)
+
+    def build(self, kind: str, spaces: Spaces, config: Mapping[str, Any], generator: torch.Generator) -> Network:
+        """Raises ValueError for another kind, TypeError for a config with other fields."""
+        match kind:
+            case "world_model":
+                return self.build_world_model(spaces, GridWorldModelConfig(**config), generator)
+            case "inverse_dynamics":
+                sparse = SparseInverseDynamicsConfig(**config)
+                return self.build_inverse_dynamics(spaces, "sparse", sparse, generator)
+            case "dense_inverse_dynamics":
+                dense = DenseInverseDynamicsConfig(**config)
+                return self.build_inverse_dynamics(spaces, "dense", dense, generator)
+            case "subgoal_generator":
+                return self.build_subgoal_generator(spaces, GridSubgoalGeneratorConfig(**config), generator)
+        raise ValueError(f"The grid family builds {', '.join(KINDS)}; got {kind!r}.")
+
+    def training_config(self, kind: str, segments: int) -> TrainingConfig:
+        """One schedule a kind, the same for every strategy."""
+        match kind:
+            case "world_model":
+                return TrainingConfig(steps=600, batch_size=32, learning_rate=1e-2, weight_decay=1e-4)
+            case "inverse_dynamics":
+                return TrainingConfig(steps=400, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
+            case "dense_inverse_dynamics":
+                return TrainingConfig(steps=400, batch_size=64, learning_rate=3e-3, weight_decay=1e-3)
+            case "subgoal_generator":
+                return TrainingConfig(steps=2000, batch_size=128, learning_rate=3e-3, weight_decay=1e-4)
+        raise ValueError(f"The grid family trains {', '.join(KINDS)}; got {kind!r}.")
+
+
+GRID = GridFamily()
+FAMILIES: dict[str, Family] = {GRID.name: GRID}
+
+
+def family_named(name: str) -> Family:
+    """Raises ValueError, in a sentence, for a name that is not in FAMILIES."""
+    if name not in FAMILIES:
+        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {name!r}.")
+    return FAMILIES[name]

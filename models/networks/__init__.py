@@ -1,0 +1,1 @@
+"""Small blocks that networks of any family are made of."""

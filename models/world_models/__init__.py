@@ -1,0 +1,1 @@
+"""World models f(z_t, a_t) -> z_{t+1}, one file a family."""

@@ -1,0 +1,26 @@
+"""What follows when a job gives up or its worker falls silent."""
+
+from datetime import datetime
+
+from sqlalchemy.orm import Session
+
+from service import jobs, rounds, scorings
+from service.store.tables import JobRow
+
+
+def reap(session: Session, now: datetime) -> None:
+    """Queue the jobs of silent workers again; what has used up its attempts fails with all that waits for it."""
+    for row in jobs.reap(session, now):
+        give_up(session, row, now)
+
+
+def give_up(session: Session, row: JobRow, now: datetime) -> None:
+    """A round or scoring whose job has failed for good has failed too."""
+    error = f"job {row.id} ({row.kind}): {row.error}"
+    if row.kind == "train_round":
+        rounds.fail(session, row.subject_id, error, now)
+    elif row.kind in ("score_shard", "merge_scores"):
+        scorings.fail(session, row.subject_id)
+        round_id = scorings.find(session, row.subject_id).round_id
+        if round_id is not None:
+            rounds.fail(session, round_id, error, now)

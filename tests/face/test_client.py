@@ -1,0 +1,193 @@
+"""What the client does by itself: retries, refusals as exceptions, paging, waiting. The service is a script here."""
+
+import json
+from collections.abc import Callable
+from uuid import UUID, uuid4
+
+import httpx
+import numpy as np
+import pytest
+
+import asim
+from api_schemas.labels import LabelsRequest
+from api_schemas.projects import ProjectPatch
+from asim.arrays import pack, unpack
+from asim.client import Client
+from asim.transport import RETRIES, Transport
+
+PROJECT = UUID(int=7)
+Answer = Callable[[httpx.Request], httpx.Response]
+
+
+class Script:
+    """Answers requests in turn, the last answer for ever; remembers what was asked."""
+
+    def __init__(self, *answers: httpx.Response | Exception) -> None:
+        self._answers = list(answers)
+        self.requests: list[httpx.Request] = []
+
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        self.requests.append(request)
+        answer = self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def client(self) -> Client:
+        return Client("http://service", transport=httpx.MockTransport(self))
+
+    def transport(self, sleeps: list[float]) -> Transport:
+        return Transport("http://service", None, 1.0, httpx.MockTransport(self), sleep=sleeps.append)
+
+
+def problem(status: int, **more: object) -> httpx.Response:
+    body = {"type": "urn:asim:error:x", "title": "x", "status": status, "detail": f"no, {status}", **more}
+    return httpx.Response(status, json=body, headers={"Content-Type": "application/problem+json"})
+
+
+def job(state: str, **more: object) -> dict[str, object]:
+    empty = dict.fromkeys(("error", "started_at", "heartbeat_at", "finished_at"))
+    return {
+        "id": str(UUID(int=1)), "project": str(PROJECT), "kind": "score_shard", "queue": "score", "state": state,
+        "attempts": 1, "max_attempts": 5, "progress": 0.5, "message": "", "result": {},
+        "created_at": "2026-01-01T00:00:00Z", **empty, **more,
+    }  # fmt: skip
+
+
+def acquisition() -> dict[str, object]:
+    return {
+        "id": str(uuid4()), "project": str(PROJECT), "purpose": "pool", "strategy": "random",
+        "requested_strategy": "random", "round": None, "status": "leased", "labeler": "", "token": 3,
+        "lease_expires_at": "2026-01-01T00:00:00Z", "created_at": "2026-01-01T00:00:00Z", "items": [],
+        "budget": {"total": None, "spent": 0, "reserved": 0, "remaining": None},
+    }  # fmt: skip
+
+
+def pending() -> httpx.Response:
+    return httpx.Response(202, json={"detail": "no ranked queue yet", "job": str(UUID(int=1))})
+
+
+@pytest.mark.parametrize("failure", [httpx.ReadError("broken"), problem(503), problem(429)])
+def test_a_get_is_asked_again_until_it_is_answered(failure: httpx.Response | Exception) -> None:
+    script, sleeps = Script(failure, failure, httpx.Response(200, text="fine")), list[float]()
+    assert script.transport(sleeps).request("GET", "/x").text == "fine"
+    assert len(script.requests) == 3
+    assert 0.2 <= sleeps[0] <= 0.25
+    assert 0.4 <= sleeps[1] <= 0.5
+
+
+def test_retry_after_sets_the_pause() -> None:
+    later = problem(503)
+    later.headers["Retry-After"] = "3"
+    sleeps: list[float] = []
+    Script(later, httpx.Response(200)).transport(sleeps).request("GET", "/x")
+    assert 3.0 <= sleeps[0] <= 3.75
+
+
+def test_a_get_gives_up_in_the_end() -> None:
+    script, sleeps = Script(httpx.ReadError("broken")), list[float]()
+    with pytest.raises(asim.Unreachable, match="no answer from http://service to GET /x: broken"):
+        script.transport(sleeps).request("GET", "/x")
+    assert len(script.requests) == RETRIES + 1
+
+
+@pytest.mark.parametrize("failure", [httpx.ReadError("broken"), problem(503)])
+def test_a_post_that_may_have_arrived_is_not_sent_again(failure: httpx.Response | Exception) -> None:
+    script = Script(failure, httpx.Response(200))
+    with pytest.raises((asim.Unreachable, asim.Unavailable)):
+        script.transport([]).request("POST", "/x")
+    assert len(script.requests) == 1
+
+
+def test_a_post_that_found_no_connection_is_sent_again() -> None:
+    script = Script(httpx.ConnectError("refused"), httpx.Response(201))
+    assert script.transport([]).request("POST", "/x").status_code == 201
+
+
+@pytest.mark.parametrize(
+    ("status", "error"),
+    [
+        (400, asim.Invalid), (401, asim.Forbidden), (403, asim.Forbidden), (404, asim.NotFound), (409, asim.Conflict),
+        (410, asim.Conflict), (423, asim.Conflict),
+        (413, asim.Invalid), (422, asim.Invalid), (500, asim.ServiceError),
+    ],
+)  # fmt: skip
+def test_a_refusal_is_raised_as_the_exception_of_its_status(status: int, error: type[asim.ServiceError]) -> None:
+    with pytest.raises(asim.ServiceError, match=f"no, {status}") as raised:
+        Script(problem(status)).client().label(LabelsRequest(project=PROJECT))
+    assert type(raised.value) is error
+    assert raised.value.problem.status == status
+
+
+def test_a_refusal_names_the_refused_fields() -> None:
+    params = [{"name": "items.0.start", "reason": "must not be negative", "value": "-1"}]
+    with pytest.raises(asim.Invalid, match=r"no, 422 \[items.0.start: must not be negative \(got -1\)\]"):
+        Script(problem(422, invalid_params=params)).client().label(LabelsRequest(project=PROJECT))
+
+
+def test_an_error_without_problem_details_still_says_what_came() -> None:
+    with pytest.raises(asim.ServiceError, match="answered 500 Internal Server Error without saying why"):
+        Script(httpx.Response(500, text="<html>")).client().job(PROJECT)
+
+
+def test_all_pages_are_read_once_each() -> None:
+    pages = [{"items": [job("done"), job("done")], "next": "b"}, {"items": [job("failed")], "next": None}]
+    script = Script(*(httpx.Response(200, json=page) for page in pages))
+    assert [each.state for each in script.client().jobs(PROJECT)] == ["done", "done", "failed"]
+    assert [request.url.params.get("cursor") for request in script.requests] == [None, "b"]
+    assert {request.url.params["project"] for request in script.requests} == {str(PROJECT)}
+
+
+def test_acquire_waits_for_the_job_that_ranks_and_asks_again() -> None:
+    script = Script(
+        pending(), httpx.Response(200, json=job("running")), httpx.Response(200, json=job("done")),
+        httpx.Response(201, json=acquisition()),
+    )  # fmt: skip
+    assert script.client().acquire(PROJECT, 4).token == 3
+    asked = [f"{request.method} {request.url.path}" for request in script.requests]
+    assert asked == ["POST /acquire", *["GET /jobs/00000000-0000-0000-0000-000000000001"] * 2, "POST /acquire"]
+
+
+def test_acquire_says_so_when_the_wait_is_over() -> None:
+    with pytest.raises(asim.NotReady, match="no ranked queue yet"):
+        Script(pending()).client().acquire(PROJECT, 4, wait=0)
+
+
+def test_a_failed_job_is_raised_with_its_reason() -> None:
+    script = Script(httpx.Response(200, json=job("failed", error="segment 12 is not finite")))
+    with pytest.raises(asim.JobFailed, match="segment 12 is not finite") as raised:
+        script.client().wait_for_job(UUID(int=1))
+    assert raised.value.job.state == "failed"
+
+
+def test_a_patch_carries_only_the_fields_that_are_set() -> None:
+    script = Script(problem(404))
+    with pytest.raises(asim.NotFound):
+        script.client().change_project(PROJECT, ProjectPatch(round_labels=5))
+    assert json.loads(script.requests[0].content) == {"round_labels": 5}
+
+
+def test_trajectories_are_sent_as_npz_files_that_keep_dtype_and_shape() -> None:
+    script = Script(httpx.Response(201, json={"items": []}))
+    grid = np.arange(24, dtype=np.uint8).reshape(2, 2, 2, 3)
+    script.client().add_trajectories(PROJECT, {"a": {"grid": grid}}, split="pool")
+    request = script.requests[0]
+    assert request.url.params["split"] == "pool"
+    assert b'name="files"; filename="a"' in request.content
+    assert pack({"grid": grid}) in request.content
+    back = unpack(pack({"grid": grid}))["grid"]
+    assert back.dtype == np.uint8
+    np.testing.assert_array_equal(back, grid)
+
+
+def test_provenance_is_states_and_metadata() -> None:
+    packed = pack({"agent": np.zeros((3, 2)), "__metadata__": np.array('{"seed": 4}')})
+    states, metadata = Script(httpx.Response(200, content=packed)).client().provenance(PROJECT, "0" * 64, 1, 2)
+    assert list(states) == ["agent"]
+    assert metadata == {"seed": 4}
+
+
+def test_a_key_travels_as_a_bearer_token() -> None:
+    script = Script(httpx.Response(200, json=[]))
+    Client("http://service", key="secret", transport=httpx.MockTransport(script)).strategies()
+    assert script.requests[0].headers["Authorization"] == "Bearer secret"

@@ -1,0 +1,67 @@
+"""asim --help answers at once, because nothing heavy is imported for it."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+# typer itself reads the parameters of a command with pydantic; ours, which build dozens of schemas, must not be added.
+HEAVY = (
+    "torch",
+    "numpy",
+    "httpx",
+    "api_schemas",
+    "service",
+    "workers",
+    "matplotlib",
+    "uvicorn",
+    "sqlalchemy",
+    "gymnasium",
+)
+COMMANDS: list[list[str]] = [
+    [],
+    ["project"],
+    ["project", "create"],
+    *([name] for name in ("serve", "worker", "demo", "collect", "import", "acquire", "label", "round", "error")),
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_help_imports_nothing_heavy(command: list[str]) -> None:
+    program = (
+        "import sys\nfrom asim.cli import main\n"
+        f"sys.argv = ['asim', *{command!r}, '--help']\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert end.code == 0, end.code\n"
+        f"print('heavy:', [name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert "Usage: asim" in printed
+    assert printed.splitlines()[-1] == "heavy: []"
+
+
+@pytest.mark.parametrize("command", [[], ["serve"], ["acquire"]], ids=" ".join)
+def test_help_answers_in_under_half_a_second(command: list[str]) -> None:
+    assert min(_seconds([sys.executable, "-m", "asim", *command, "--help"]) for _ in range(3)) < 0.5
+
+
+def test_the_top_help_needs_no_pydantic() -> None:
+    program = "import sys, asim.cli; print('pydantic' in sys.modules)"
+    assert (
+        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "False\n"
+    )
+
+
+def test_importing_asim_imports_nothing_heavy_but_names_the_client() -> None:
+    program = (
+        f"import asim, sys; print([name for name in {HEAVY!r} if name in sys.modules]); "
+        "print(asim.Client.__module__, asim.NotFound.__mro__[1].__name__)"
+    )
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert printed.splitlines() == ["[]", "asim.client ServiceError"]
+
+
+def _seconds(argv: list[str]) -> float:
+    began = time.monotonic()
+    subprocess.run(argv, capture_output=True, check=True)
+    return time.monotonic() - began

@@ -1,0 +1,60 @@
+"""Learning curves as a figure and as a table."""
+
+import struct
+from datetime import UTC, datetime
+from pathlib import Path
+from uuid import uuid4
+
+from rich.console import Console
+
+from api_schemas.rounds import GroupError, ModelError, ModelErrorCurve, ModelErrorPoint
+from asim.figure import draw_learning_curves
+from asim.tables import error_table
+
+
+def curve(losses: dict[int, float | None]) -> ModelErrorCurve:
+    points = [
+        ModelErrorPoint(
+            round=uuid4(),
+            number=number,
+            labels=labels,
+            created_at=datetime(2026, 1, 1, tzinfo=UTC),
+            model_error=ModelError(
+                transitions=10,
+                loss=loss,
+                dynamics_accuracy=None if loss is None else 1 - loss,
+                inverse_accuracy=None,
+                by_group={
+                    "movement": GroupError(transitions=5, loss=loss, dynamics_accuracy=0.9, inverse_accuracy=None),
+                    "interaction": GroupError(transitions=0, loss=None, dynamics_accuracy=None, inverse_accuracy=None),
+                },
+            ),
+        )
+        for number, (labels, loss) in enumerate(losses.items(), 1)
+    ]
+    return ModelErrorCurve(project=uuid4(), points=points)
+
+
+def test_the_figure_is_a_png_of_readable_size(tmp_path: Path) -> None:
+    path = tmp_path / "results" / "curves.png"
+    draw_learning_curves({"cycle": curve({200: 0.5, 300: 0.25}), "random": curve({200: 0.5, 300: None})}, path)
+    content = path.read_bytes()
+    assert content.startswith(b"\x89PNG")
+    width, height = struct.unpack(">II", content[16:24])
+    assert width > 1000
+    assert height > 400
+
+
+def test_the_figure_of_a_project_without_rounds_is_empty_and_no_error(tmp_path: Path) -> None:
+    draw_learning_curves({"new": curve({})}, tmp_path / "empty.png")
+    assert (tmp_path / "empty.png").stat().st_size > 0
+
+
+def test_the_table_shows_each_round_and_leaves_unknown_numbers_blank() -> None:
+    console = Console(width=120, record=True, quiet=True)
+    console.quiet = False
+    with console.capture() as captured:
+        console.print(error_table({"cycle": curve({200: 0.5, 300: 0.25})}, first_column="strategy"))
+    lines = [line.split() for line in captured.get().splitlines() if line.strip()]
+    assert lines[0] == ["strategy", "labels", "test", "loss", "Dynamics", "Accuracy", "movement", "interaction"]
+    assert lines[1:] == [["cycle", "200", "0.5000", "50.0%", "90.0%"], ["cycle", "300", "0.2500", "75.0%", "90.0%"]]

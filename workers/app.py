@@ -1,0 +1,60 @@
+"""The Celery app of scaled-out mode. A message carries a job id; the job table decides whether there is work in it.
+
+celery -A workers.app worker -Q asim.train,asim.score -c 1
+"""
+
+import threading
+from functools import cache
+from typing import get_args
+from uuid import UUID
+
+from celery.signals import worker_process_init, worker_ready
+
+from api_schemas.jobs import RUN_JOB, Queue
+from service import jobs
+from service.api.dependencies import utc_now
+from service.carrier import celery_app
+from service.log import configure_logs
+from service.settings import Settings
+from workers.dispatch import open_worker
+from workers.dispatch import run_job as run_job_here
+from workers.job import Worker
+
+settings = Settings()
+app = celery_app(settings)
+
+
+@app.task(name=RUN_JOB, acks_late=True, ignore_result=True)  # type: ignore[untyped-decorator]  # celery has no types
+def run_job(job_id: str) -> None:
+    """Run one job, if it is still to be run."""
+    run_job_here(worker(), UUID(job_id))
+
+
+@cache
+def worker() -> Worker:
+    """This process's connections, opened at its first task."""
+    return open_worker(settings, utc_now, get_args(Queue))
+
+
+@worker_process_init.connect  # type: ignore[untyped-decorator]  # celery has no types
+def _prepare_child(**_: object) -> None:
+    from workers.runner import limit_threads
+
+    configure_logs()
+    limit_threads(settings)
+
+
+@worker_ready.connect  # type: ignore[untyped-decorator]  # celery has no types
+def _say_alive(**_: object) -> None:
+    """The parent process speaks for its children."""
+    threading.Thread(target=_beat, name="alive", daemon=True).start()
+
+
+def _beat() -> None:
+    from workers.runner import ALIVE_SECONDS
+
+    parent = worker()
+    while not parent.stopping.is_set():
+        with parent.database.write() as session:
+            jobs.worker_alive(session, parent.owner, parent.queues, parent.clock())
+        parent.stopping.wait(ALIVE_SECONDS)

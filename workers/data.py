@@ -1,0 +1,125 @@
+"""From rows and blobs to segment batches. Observations and labels only: nothing here can open a simulator state."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session
+
+from api_schemas.environments import DiscreteActions, Spaces
+from models.families import BoxAction, DiscreteAction, StreamSpec
+from models.families import Spaces as ModelSpaces
+from models.segments import Segment, SegmentBatch, concatenate
+from service import projects
+from service.store import codec
+from service.store.blobs import Blobs
+from service.store.queries import labels as label_queries
+from service.store.queries import pool as pool_queries
+from service.store.tables import LabelRow, MembershipRow, ProjectRow
+
+CHUNK_SEGMENTS = 4096  # segments decoded at a time: bounds memory whatever the size of the pool
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Segments to cut from one stored trajectory."""
+
+    trajectory: str
+    blob_sha256: str
+    starts: tuple[int, ...]
+
+
+def model_spaces(spaces: Spaces) -> ModelSpaces:
+    """The project's spaces as models take them."""
+    streams = {name: StreamSpec(stream.shape, stream.dtype) for name, stream in spaces.observations.items()}
+    action = spaces.actions
+    if isinstance(action, DiscreteActions):
+        return ModelSpaces(streams, DiscreteAction(action.n))
+    return ModelSpaces(streams, BoxAction(action.low, action.high, action.shape))
+
+
+def windows_of(
+    session: Session, project: ProjectRow, members: Sequence[MembershipRow], starts: Mapping[str, Sequence[int]] | None
+) -> list[Windows]:
+    """The given segments of these members, or all of theirs, in the members' order."""
+    contents = pool_queries.contents(session, [member.trajectory_id for member in members])
+    windows = []
+    for member in members:
+        every = range(0, member.segments * project.stride, project.stride)
+        chosen = tuple(every if starts is None else starts[member.trajectory_id])
+        windows.append(Windows(member.trajectory_id, contents[member.trajectory_id].blob_sha256, chosen))
+    return windows
+
+
+def load(blobs: Blobs, windows: Sequence[Windows], length: int) -> SegmentBatch:
+    """All windows as one batch of segments of `length` transitions, in order."""
+    parts: dict[str, list[NDArray[Any]]] = {}
+    segments: list[Segment] = []
+    for window in windows:
+        data = blobs.get("trajectories", window.blob_sha256)
+        arrays, _ = codec.decode(data, f"trajectory {window.trajectory}")
+        index = np.asarray(window.starts)[:, None] + np.arange(length + 1)  # (S, L+1)
+        for name, array in arrays.items():
+            parts.setdefault(name, []).append(array[index])  # (T+1, ...) -> (S, L+1, ...)
+        segments.extend(Segment(window.trajectory, start) for start in window.starts)
+    observations = {name: torch.from_numpy(np.concatenate(arrays)) for name, arrays in parts.items()}
+    return SegmentBatch(observations, segments=tuple(segments))
+
+
+def chunks(blobs: Blobs, windows: Sequence[Windows], length: int) -> Iterator[SegmentBatch]:
+    """The same segments in batches of about CHUNK_SEGMENTS, whole trajectories each."""
+    group: list[Windows] = []
+    for window in windows:
+        if not window.starts:
+            continue
+        group.append(window)
+        if sum(len(member.starts) for member in group) >= CHUNK_SEGMENTS:
+            yield load(blobs, group, length)
+            group = []
+    if group:
+        yield load(blobs, group, length)
+
+
+def labeled_batch(
+    session: Session, blobs: Blobs, project: ProjectRow, split: str, watermark: int
+) -> SegmentBatch | None:
+    """All labeled segments of a split up to a watermark, in the order of acceptance; None where there are none."""
+    rows = label_queries.labels_up_to(session, project.id, split, watermark)
+    if not rows:
+        return None
+    contents = pool_queries.contents(session, sorted({row.trajectory_id for row in rows}))
+    windows = [Windows(row.trajectory_id, contents[row.trajectory_id].blob_sha256, (row.start,)) for row in rows]
+    batch = load_in_order(blobs, windows, project.segment_length)
+    action = projects.spaces_of(project).actions
+    if not isinstance(action, DiscreteActions):
+        actions = torch.tensor([row.actions for row in rows], dtype=torch.float32)  # (B, L, D)
+        return SegmentBatch(batch.observations, actions, segments=batch.segments)
+    actions = torch.tensor([row.actions for row in rows], dtype=torch.int64)  # (B, L)
+    return SegmentBatch(batch.observations, actions, _sets(rows, action.n), batch.segments)
+
+
+def load_in_order(blobs: Blobs, windows: Sequence[Windows], length: int) -> SegmentBatch:
+    """Each trajectory is opened once, and the segments come back in the order in which they were asked for."""
+    places: dict[str, list[int]] = {}
+    for place, window in enumerate(windows):
+        places.setdefault(window.trajectory, []).append(place)
+    grouped = [
+        Windows(name, windows[of[0]].blob_sha256, tuple(windows[place].starts[0] for place in of))
+        for name, of in places.items()
+    ]
+    batch = concatenate([load(blobs, [window], length) for window in grouped])
+    order = [place for of in places.values() for place in of]
+    return batch.take(torch.from_numpy(np.argsort(order)))
+
+
+def _sets(rows: Sequence[LabelRow], n: int) -> torch.Tensor:
+    """(B, L, n) bool: the stored set of a step, or its action alone."""
+    sets = torch.zeros(len(rows), len(rows[0].actions), n, dtype=torch.bool)
+    for i, row in enumerate(rows):
+        choices: Any = row.action_sets or [[action] for action in row.actions]
+        for step, actions in enumerate(choices):
+            sets[i, step, actions] = True
+    return sets

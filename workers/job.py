@@ -1,0 +1,108 @@
+"""A job while it runs: its lease, its transactions, its heartbeat."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from types import TracebackType
+from typing import Self
+
+from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session
+
+from service import jobs
+from service.errors import JobLost
+from service.log import get_logger
+from service.settings import Settings
+from service.store.blobs import Blobs
+from service.store.database import Database
+from service.store.queries import jobs as queries
+
+log = get_logger("worker")
+
+
+class GaveWay(Exception):
+    """The job stops here and is queued again: its process ends, or work of higher priority waits."""
+
+
+@dataclass(frozen=True)
+class Worker:
+    """What a worker process holds open. It has no way to simulator states or provenance."""
+
+    settings: Settings
+    database: Database
+    blobs: Blobs
+    clock: Callable[[], datetime]
+    owner: str
+    queues: tuple[str, ...]
+    stopping: threading.Event = field(default_factory=threading.Event)
+
+
+class RunningJob:
+    """One attempt at a job. Its writes go through `transaction`, which refuses them once the lease is lost."""
+
+    def __init__(self, worker: Worker, lease: jobs.Lease) -> None:
+        self.worker, self.lease = worker, lease
+        self._progress, self._message = 0.0, ""
+        self._lost = threading.Event()
+
+    @contextmanager
+    def transaction(self) -> Iterator[Session]:
+        """A write transaction under this attempt's fence. Raises JobLost."""
+        with self.worker.database.write() as session:
+            jobs.held(session, self.lease)
+            yield session
+
+    def now(self) -> datetime:
+        """The worker's clock."""
+        return self.worker.clock()
+
+    def report(self, progress: float, message: str) -> None:
+        """Say how far the job is; the heartbeat writes it. Raises JobLost, and GaveWay when the process ends."""
+        self._progress, self._message = progress, message
+        if self._lost.is_set():
+            raise JobLost(self.lease.job_id, self.lease.fence)
+        if self.worker.stopping.is_set():
+            raise GaveWay(f"worker {self.worker.owner} stops")
+
+    def should_give_way(self) -> bool:
+        """True where the process ends or a job of higher priority waits for this worker."""
+        if self.worker.stopping.is_set():
+            return True
+        with self.worker.database.read() as session:
+            return queries.higher_waiting(session, self.worker.queues, self.lease.priority, self.now())
+
+    def beat(self) -> None:
+        """Renew the lease once."""
+        seconds = self.worker.settings.job_lease_seconds
+        try:
+            with self.worker.database.write() as session:
+                jobs.heartbeat(session, self.lease, self.now(), seconds, self._progress, self._message)
+        except JobLost:
+            self._lost.set()
+        except OperationalError as error:  # the next beat tries again; the lease outlasts a few of them
+            log.warning("heartbeat_failed", job=str(self.lease.job_id), error=str(error))
+
+
+class Heartbeat:
+    """Beats a job's heart from a thread, three times a lease, while the block runs."""
+
+    def __init__(self, job: RunningJob) -> None:
+        self._job = job
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._done.wait(min(2.0, self._job.worker.settings.job_lease_seconds / 3)):
+            self._job.beat()

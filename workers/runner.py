@@ -1,0 +1,100 @@
+"""The embedded carrier: a process that claims jobs from the job table and runs them, one at a time.
+
+    python -m workers.runner --queues train,score,default --parent 4711
+
+It ends on SIGTERM and SIGINT, giving its job back, and by itself when its parent is gone.
+"""
+
+import argparse
+import os
+import signal
+import threading
+import time
+from types import FrameType
+
+from sqlalchemy.exc import OperationalError
+
+from service import jobs, reaper
+from service.api.dependencies import utc_now
+from service.log import configure_logs, get_logger
+from service.settings import Settings
+from workers.dispatch import open_worker, run_next
+from workers.job import Worker
+
+log = get_logger("runner")
+ALIVE_SECONDS = 5.0
+REAP_SECONDS = 1.0
+
+
+def run(worker: Worker) -> None:
+    """Claim and run jobs until the worker is told to stop."""
+    threading.Thread(target=_say_alive, args=(worker,), name="alive", daemon=True).start()
+    reaped = 0.0
+    while not worker.stopping.is_set():
+        try:
+            if time.monotonic() - reaped > REAP_SECONDS:
+                with worker.database.write() as session:
+                    reaper.reap(session, worker.clock())
+                reaped = time.monotonic()
+            if not run_next(worker):
+                worker.stopping.wait(worker.settings.poll_seconds)
+        except OperationalError as error:  # a busy or restarting database; the job's lease brings it back
+            log.warning("database_unreachable", error=str(error))
+            worker.stopping.wait(1.0)
+    worker.database.close()
+
+
+def limit_threads(settings: Settings) -> None:
+    """Torch's threads for this process: 1 by default, so that workers side by side do not fight for cores."""
+    import torch
+
+    torch.set_num_threads(settings.torch_threads)
+
+
+def main() -> None:
+    """Entry of the process."""
+    parser = argparse.ArgumentParser(prog="python -m workers.runner")
+    parser.add_argument("--queues", default="train,score,label,default", help="comma-separated")
+    parser.add_argument("--parent", type=int, default=None, help="end when the parent is no longer this process")
+    options = parser.parse_args()
+    configure_logs()
+    settings, queues = Settings(), tuple(options.queues.split(","))
+    if {"train", "score"} & set(queues):
+        limit_threads(settings)
+    worker = open_worker(settings, utc_now, queues)
+    _stop_on_signals(worker)
+    if options.parent is not None:
+        threading.Thread(target=_end_with, args=(options.parent,), name="parent", daemon=True).start()
+    log.info("runner_started", owner=worker.owner, queues=queues)
+    run(worker)
+
+
+def _say_alive(worker: Worker) -> None:
+    while True:
+        try:
+            with worker.database.write() as session:
+                jobs.worker_alive(session, worker.owner, worker.queues, worker.clock())
+        except OperationalError as error:
+            log.warning("database_unreachable", error=str(error))
+        if worker.stopping.wait(ALIVE_SECONDS):
+            return
+
+
+def _stop_on_signals(worker: Worker) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
+        log.info("runner_stopping", signal=signal.Signals(number).name)
+        worker.stopping.set()
+
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
+
+
+def _end_with(parent: int) -> None:
+    """An orphan must not work on beside the runner that a new parent starts."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(3)
+
+
+if __name__ == "__main__":
+    main()

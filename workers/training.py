@@ -1,0 +1,185 @@
+"""Rounds: train, evaluate, ask for the scoring. Each stage is stored before the next; a stored one is not redone."""
+
+import time
+import zlib
+from dataclasses import dataclass
+
+import torch
+
+from api_schemas.jobs import TrainRound, TrainSubgoalGenerator
+from models import checkpoints
+from models.families import Family, family_named
+from models.segments import SegmentBatch
+from models.training import TrainingState, begin, train, train_subgoal_generator
+from service import projects, registry, rounds, scorings
+from service.errors import NothingToLearn
+from service.registry import TrainedModel
+from service.store.queries import acquisitions as scoring_queries
+from service.store.queries import pool as pool_queries
+from service.store.queries import rounds as round_queries
+from service.store.tables import JobRow, ProjectRow, RoundRow
+from workers import data
+from workers.evaluation import model_error
+from workers.job import GaveWay, RunningJob
+
+ENSEMBLE_MEMBERS = 3
+BASE = frozenset({"inverse_dynamics", "world_model"})  # every round has these; model error is theirs
+ORDER = ("inverse_dynamics", "dense_inverse_dynamics", "world_model", "ensemble")
+SUBGOAL_SLICE = 5  # steps between two looks at whether other work waits
+SUBGOAL_SEGMENTS = 50_000  # a larger pool is thinned out evenly
+CHECKPOINT_SECONDS = 30.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a round trains on, and which networks."""
+
+    project: ProjectRow
+    round: RoundRow
+    strategy: str
+    stages: tuple[tuple[str, int], ...]
+
+    @property
+    def family(self) -> Family:
+        """The project's model family."""
+        return family_named(self.project.family)
+
+
+def run_round(job: RunningJob, payload: TrainRound) -> dict[str, object]:
+    """Bring a round to where its scoring begins. May run twice, and after a crash at any line."""
+    plan = _plan(job, payload)
+    with job.transaction() as session:
+        rounds.begin_training(session, plan.round.id)
+    labeled = _labels(job, plan, "pool")
+    if labeled is None:
+        raise NothingToLearn(plan.project.id)
+    for number, (kind, member) in enumerate(plan.stages):
+        _train_stage(job, plan, kind, member, labeled, number)
+    _evaluate_stage(job, plan)
+    return _request_scoring(job, plan)
+
+
+def run_subgoal_generator(job: RunningJob, payload: TrainSubgoalGenerator) -> dict[str, object]:
+    """Train the subgoal generator on the pool's observations, giving way to any other work."""
+    with job.worker.database.read() as session:
+        project = projects.find(session, payload.project)
+        members = pool_queries.memberships(session, project.id, "pool")
+        windows = data.windows_of(session, project, members, None)
+    every = max(1, sum(len(window.starts) for window in windows) // SUBGOAL_SEGMENTS)
+    thinned = [data.Windows(w.trajectory, w.blob_sha256, w.starts[::every]) for w in windows if w.starts]
+    batch = data.load(job.worker.blobs, thinned, project.segment_length)
+    family = family_named(project.family)
+    generator = _generator(project, 0, "subgoal_generator", 0)
+    network = family.build_subgoal_generator(data.model_spaces(projects.spaces_of(project)), None, generator)
+    config = family.training_config("subgoal_generator", batch.size)
+    state = _resume(job) or begin(network, config, generator)
+    saved = time.monotonic()
+    while state.step < state.config.steps:
+        if job.should_give_way():
+            _save_state(job, state)
+            raise GaveWay(f"other work waits at step {state.step} of {state.config.steps}")
+        if time.monotonic() - saved > CHECKPOINT_SECONDS:
+            _save_state(job, state)
+            saved = time.monotonic()
+        state = train_subgoal_generator(network, batch, state, SUBGOAL_SLICE)
+        job.report(state.step / state.config.steps, f"subgoal generator, step {state.step} of {state.config.steps}")
+    blob = checkpoints.save(network)
+    trained = _trained(job, "subgoal_generator", 0, blob, {"loss": sum(state.recent) / len(state.recent)})
+    with job.transaction() as session:
+        row = registry.register(session, project.id, None, trained, members[-1].id, job.now())
+    return {"model": str(row.id), "segments": batch.size}
+
+
+def _plan(job: RunningJob, payload: TrainRound) -> Plan:
+    kinds = BASE | scorings.NEEDS[payload.strategy]
+    members = {"ensemble": ENSEMBLE_MEMBERS}
+    stages = tuple((kind, member) for kind in ORDER if kind in kinds for member in range(members.get(kind, 1)))
+    with job.worker.database.read() as session:
+        round_row = rounds.find(session, payload.round)
+        return Plan(projects.find(session, round_row.project_id), round_row, payload.strategy, stages)
+
+
+def _labels(job: RunningJob, plan: Plan, split: str) -> SegmentBatch | None:
+    with job.worker.database.read() as session:
+        return data.labeled_batch(session, job.worker.blobs, plan.project, split, plan.round.watermark)
+
+
+def _train_stage(job: RunningJob, plan: Plan, kind: str, member: int, labeled: SegmentBatch, number: int) -> None:
+    """Train one network and register it, unless an earlier attempt did."""
+    with job.worker.database.read() as session:
+        if any(row.member == member for row in registry.of_round(session, plan.round.id, kind)):
+            return
+    started = time.monotonic()
+    network_kind = "world_model" if kind == "ensemble" else kind
+    generator = _generator(plan.project, plan.round.number, kind, member)
+    spaces = data.model_spaces(projects.spaces_of(plan.project))
+    network = plan.family.build(network_kind, spaces, {}, generator)
+
+    def progress(step: int, steps: int, loss: float) -> None:
+        share = (number + step / steps) / (len(plan.stages) + 1)
+        job.report(share, f"round {plan.round.number}: {kind}, step {step} of {steps}, loss {loss:.3f}")
+
+    config = plan.family.training_config(network_kind, labeled.size)
+    result = train(network, labeled, config, generator, "cpu", progress)
+    blob = checkpoints.save(network)
+    trained = _trained(job, kind, member, blob, {"loss": result.final_loss})
+    with job.transaction() as session:
+        registry.register(session, plan.project.id, plan.round.id, trained, plan.round.watermark, job.now())
+        name = f"{kind}-{member}" if kind == "ensemble" else kind
+        rounds.stage_done(session, plan.round.id, name, time.monotonic() - started)
+
+
+def _evaluate_stage(job: RunningJob, plan: Plan) -> None:
+    """Model error on the labeled held-out segments, unless an earlier attempt stored it."""
+    with job.worker.database.read() as session:
+        if rounds.find(session, plan.round.id).model_error is not None:
+            return
+        (world_model,) = registry.of_round(session, plan.round.id, "world_model")
+        (inverse,) = registry.of_round(session, plan.round.id, "inverse_dynamics")
+    started = time.monotonic()
+    job.report(len(plan.stages) / (len(plan.stages) + 1), f"round {plan.round.number}: evaluation")
+    held_out = _labels(job, plan, "held_out")
+    error = model_error(job.worker.blobs, plan.project, world_model, inverse, held_out)
+    with job.transaction() as session:
+        rounds.record_error(session, plan.round.id, error, job.now())
+        rounds.stage_done(session, plan.round.id, "evaluation", time.monotonic() - started)
+
+
+def _request_scoring(job: RunningJob, plan: Plan) -> dict[str, object]:
+    """A strategy that needs models is scored under this round's; the others have nothing to wait for."""
+    limits = scorings.limits_of(job.worker.settings)
+    with job.transaction() as session:
+        rounds.begin_scoring(session, plan.round.id)
+        if not scorings.NEEDS[plan.strategy]:
+            rounds.make_current(session, plan.round.id, job.now())
+        elif scoring_queries.newest_scoring(session, plan.project.id, plan.strategy, plan.round.id) is None:
+            project = projects.find(session, plan.project.id)
+            scorings.start(session, project, plan.strategy, rounds.find(session, plan.round.id), job.now(), limits)
+        models = round_queries.models_of(session, plan.round.id)
+    return {"round": str(plan.round.id), "models": len(models)}
+
+
+def _generator(project: ProjectRow, round_number: int, kind: str, member: int) -> torch.Generator:
+    """All chance of a stage. Projects of equal seed draw alike, so their arms differ in their labels only."""
+    text = f"{project.seed}/{round_number}/{kind}/{member}"
+    return torch.Generator().manual_seed(zlib.crc32(text.encode()))
+
+
+def _trained(job: RunningJob, kind: str, member: int, blob: bytes, metrics: dict[str, float]) -> TrainedModel:
+    description = checkpoints.describe(blob)
+    sha256 = job.worker.blobs.put("weights", blob)
+    return TrainedModel(kind, member, description["family"], description["config"], sha256, len(blob), metrics)
+
+
+def _resume(job: RunningJob) -> TrainingState | None:
+    """The state that an earlier attempt left."""
+    with job.worker.database.read() as session:
+        row = session.get_one(JobRow, job.lease.job_id)
+        sha256 = row.checkpoint_sha256
+    return TrainingState.from_bytes(job.worker.blobs.get("checkpoints", sha256)) if sha256 else None
+
+
+def _save_state(job: RunningJob, state: TrainingState) -> None:
+    sha256 = job.worker.blobs.put("checkpoints", state.to_bytes())
+    with job.transaction() as session:
+        session.get_one(JobRow, job.lease.job_id).checkpoint_sha256 = sha256
