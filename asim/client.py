@@ -50,16 +50,23 @@ class Client:
         key: an API key; embedded mode needs none.
         timeout: seconds without a byte after which a request counts as lost.
         transport: an httpx transport, for tests.
+        retries: how often a GET, or a request that found no connection, is sent again.
 
     Every method raises asim.errors.ServiceError (or its subclass for the status) where the service refuses, and
     asim.errors.Unreachable where no answer comes.
     """
 
     def __init__(
-        self, base_url: str, key: str | None = None, timeout: float = 60.0, transport: httpx.BaseTransport | None = None
+        self,
+        base_url: str,
+        key: str | None = None,
+        timeout: float = 60.0,
+        transport: httpx.BaseTransport | None = None,
+        *,
+        retries: int = 5,
     ) -> None:
         self.base_url = base_url.rstrip("/")
-        self._transport = Transport(self.base_url, key, timeout, transport)
+        self._transport = Transport(self.base_url, key, timeout, transport, retries=retries)
 
     def __enter__(self) -> Self:
         return self

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from workers.labeling import run_labeling
 
 from api_schemas.acquisitions import Acquisition
 from api_schemas.collections import CollectionCreate, CollectionLabels
@@ -26,6 +25,7 @@ from asim.report import Report
 from asim.rounds import await_round
 from asim.served import served
 from asim.tables import error_table
+from workers.labeling import run_labeling
 
 STRATEGIES: tuple[StrategyName, ...] = ("cycle", "random")
 ENVIRONMENT = Environment(simulator="minigrid", options={"task": "any", "room_size": 6, "objects": 3})
@@ -155,7 +155,9 @@ class Arm:
     def _collect(self, collection: CollectionCreate, what: str) -> None:
         with self._report.step(f"{self.project.name}: {what}") as advance:
             job = self._client.collect(collection)
-            self._client.wait_for_job(job.id, progress=lambda seen: advance(seen.progress, seen.message))
+            done = self._client.wait_for_job(job.id, progress=lambda seen: advance(seen.progress, seen.message))
+        if done.result.get("short_of"):
+            raise AsimError(f"{self.project.name}: the test set lacks labels: {done.result['short_of']}")
 
 
 def _write_results(curves: Mapping[str, ModelErrorCurve], picture: Path) -> Path:

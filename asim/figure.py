@@ -5,11 +5,12 @@ from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator
 
 from api_schemas.rounds import ModelError, ModelErrorCurve
 
 COLOURS = ("#1f6f8b", "#d1495b", "#66a182", "#edae49", "#6c4f82", "#5c5c5c")
+MOST_TICKS = 10
 Metric = Callable[[ModelError], float | None]
 
 
@@ -32,7 +33,9 @@ def _draw(axes: Axes, curves: Mapping[str, ModelErrorCurve], title: str, metric:
         axes.plot([x for x, _ in known], [y for _, y in known], marker="o", markersize=4, color=colour, label=name)
     axes.set_title(title, loc="left", fontsize=10)
     axes.set_xlabel("pool labels")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    labels = sorted({point.labels for curve in curves.values() for point in curve.points})
+    axes.xaxis.set_major_locator(FixedLocator(labels) if len(labels) <= MOST_TICKS else MaxNLocator(integer=True))
+    axes.set_ylim(bottom=0)
     axes.grid(axis="y", color="#e3e3e3", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

@@ -29,7 +29,8 @@ class Report:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bars.stop()
+        if self.console.is_terminal:
+            self._bars.stop()
 
     def tell(self, line: str) -> None:
         """One line, above any bars."""

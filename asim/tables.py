@@ -64,5 +64,7 @@ def _table(first: str, *others: str) -> Table:
     table.add_column(first, overflow="fold")
     for name in others:
         text = name in ("id", "trajectory", "environment", "strategy")
-        table.add_column(name, justify="left" if text else "right", overflow="fold")
+        table.add_column(
+            name, justify="left" if text else "right", overflow="fold", no_wrap=name in ("id", "trajectory")
+        )
     return table

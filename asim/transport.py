@@ -10,7 +10,6 @@ from pydantic import BaseModel, ValidationError
 from api_schemas.errors import Problem
 from asim.errors import ServiceError, Unreachable, service_error
 
-RETRIES = 5
 RETRIED_STATUSES = frozenset({429, 502, 503, 504})
 LONGEST_PAUSE = 10.0  # seconds
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -31,6 +30,8 @@ class Transport:
         key: str | None,
         timeout: float,
         transport: httpx.BaseTransport | None,
+        *,
+        retries: int = 5,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
@@ -38,6 +39,7 @@ class Transport:
         self._http = httpx.Client(
             base_url=base_url, headers=headers, timeout=timeout, transport=transport, trust_env=remote
         )
+        self._retries = retries
         self._sleep = sleep
         self._random = random.Random()
 
@@ -67,7 +69,7 @@ class Transport:
             outcome = self._attempt(request)
             if isinstance(outcome, httpx.Response) and (outcome.is_success or outcome.status_code in accept):
                 return outcome
-            if attempt >= RETRIES or not _may_repeat(method, outcome):
+            if attempt >= self._retries or not _may_repeat(method, outcome):
                 raise _failure(outcome, request)
             self._sleep(self._pause(attempt, outcome))
             attempt += 1

@@ -123,7 +123,7 @@ def describe(session: Session, row: AcquisitionRow, now: datetime, *, with_token
         status="expired" if expired else row.status,  # type: ignore[arg-type]  # pydantic checks the literal
         token=row.token if with_token else None,
         items=items,
-        budget=projects.budget_of(session, project, now),
+        budget=projects.budget_of(project, pool_queries.split_count(session, project.id, "pool", now)),
         **fields,
     )
 
@@ -138,9 +138,10 @@ def _check_counts(session: Session, project: ProjectRow, request: AcquireRequest
     split = pool_queries.split_count(session, project.id, request.purpose, now)
     if request.count > split.free:
         raise PoolExhausted(request.count, split.free, request.purpose)
-    budget = projects.budget_of(session, project, now)
-    short = budget.remaining is not None and request.count > budget.remaining
-    if request.purpose == "pool" and short and budget.remaining is not None and budget.total is not None:
+    budget = projects.budget_of(project, split)
+    if request.purpose == "held_out" or budget.total is None or budget.remaining is None:
+        return
+    if request.count > budget.remaining:
         raise BudgetExhausted(request.count, budget.remaining, budget.total)
 
 
@@ -189,9 +190,8 @@ def _lease(
     )
     session.add(row)
     session.flush()
-    for rank, candidate in enumerate(draw.candidates):
-        session.add(_item(row, rank, candidate))
-        queries.take_claim(session, _claim(row, candidate))
+    session.add_all([_item(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
+    queries.take_claims(session, [_claim(row, candidate) for candidate in draw.candidates])
     data = {"acquisition": str(row.id), "count": request.count, "strategy": row.strategy, "labeler": row.labeler}
     events.record(session, project.id, "lease.given", data, now)
     session.flush()

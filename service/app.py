@@ -8,8 +8,9 @@ from importlib.metadata import version
 from fastapi import FastAPI
 
 from service.api import acquisitions, jobs, labels, problems, projects, rounds, security, system, trajectories
-from service.api.dependencies import Services, utc_now
+from service.api.dependencies import Services
 from service.carrier import Relay
+from service.clock import utc_now
 from service.dashboard import page
 from service.settings import Settings
 from service.store.blobs import Blobs

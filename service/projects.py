@@ -12,6 +12,7 @@ from service import events
 from service.errors import NameTaken, UnknownResource
 from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
+from service.store.queries.pool import SplitCount
 from service.store.tables import ProjectRow
 
 
@@ -70,9 +71,11 @@ def environment_of(row: ProjectRow) -> Environment:
     return Environment.model_validate(row.environment)
 
 
-def budget_of(session: Session, row: ProjectRow, now: datetime) -> Budget:
-    """Labels spent and reserved against the budget."""
-    return _budget(row, pool_queries.split_count(session, row.id, "pool", now))
+def budget_of(row: ProjectRow, pool: SplitCount) -> Budget:
+    """Labels spent and reserved against the budget, from the counts of the pool split."""
+    total = policy_of(row).label_budget
+    remaining = None if total is None else max(0, total - pool.labeled - pool.leased)
+    return Budget(total=total, spent=pool.labeled, reserved=pool.leased, remaining=remaining)
 
 
 def describe(session: Session, row: ProjectRow, now: datetime) -> Project:
@@ -101,14 +104,8 @@ def describe(session: Session, row: ProjectRow, now: datetime) -> Project:
         seed=row.seed,
         policy=policy_of(row),
         counts=counts,
-        budget=_budget(row, pool),
+        budget=budget_of(row, pool),
         label_watermark=row.label_watermark,
         current_round=current.id if current else None,
         created_at=row.created_at,
     )
-
-
-def _budget(row: ProjectRow, pool: pool_queries.SplitCount) -> Budget:
-    total = policy_of(row).label_budget
-    remaining = None if total is None else max(0, total - pool.labeled - pool.leased)
-    return Budget(total=total, spent=pool.labeled, reserved=pool.leased, remaining=remaining)

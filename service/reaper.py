@@ -1,17 +1,21 @@
 """What follows when a job gives up or its worker falls silent."""
 
-from datetime import datetime
+from datetime import datetime, timedelta
 
 from sqlalchemy.orm import Session
 
 from service import jobs, rounds, scorings
+from service.store.queries import jobs as job_queries
 from service.store.tables import JobRow
+
+WORKER_MEMORY = timedelta(hours=1)
 
 
 def reap(session: Session, now: datetime) -> None:
     """Queue the jobs of silent workers again; what has used up its attempts fails with all that waits for it."""
     for row in jobs.reap(session, now):
         give_up(session, row, now)
+    job_queries.forget_workers(session, now - WORKER_MEMORY)
 
 
 def give_up(session: Session, row: JobRow, now: datetime) -> None:

@@ -12,8 +12,8 @@ from celery.signals import worker_process_init, worker_ready
 
 from api_schemas.jobs import RUN_JOB, Queue
 from service import jobs
-from service.api.dependencies import utc_now
 from service.carrier import celery_app
+from service.clock import utc_now
 from service.log import configure_logs
 from service.settings import Settings
 from workers.dispatch import open_worker

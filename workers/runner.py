@@ -15,7 +15,7 @@ from types import FrameType
 from sqlalchemy.exc import OperationalError
 
 from service import jobs, reaper
-from service.api.dependencies import utc_now
+from service.clock import utc_now
 from service.log import configure_logs, get_logger
 from service.settings import Settings
 from workers.dispatch import open_worker, run_next

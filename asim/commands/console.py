@@ -9,6 +9,7 @@ from asim.errors import AsimError
 if TYPE_CHECKING:
     from asim.client import Client
 
+RETRIES = 3  # a person at a terminal would rather know soon
 DEFAULT_URL = "http://127.0.0.1:8000"
 Url = Annotated[str, typer.Option("--url", envvar="ASIM_URL", help="Where the service listens.")]
 Key = Annotated[str | None, typer.Option("--key", envvar="ASIM_KEY", help="API key; embedded mode needs none.")]
@@ -26,7 +27,7 @@ def connect(url: str, key: str | None) -> "Client":
     """A client of the service at `url`."""
     from asim.client import Client
 
-    return Client(url, key)
+    return Client(url, key, retries=RETRIES)
 
 
 def explain(error: Exception) -> str | None:
@@ -36,8 +37,12 @@ def explain(error: Exception) -> str | None:
     from pydantic import ValidationError
 
     if isinstance(error, ValidationError):
-        fields = (f"{'.'.join(map(str, each['loc'])) or 'request'}: {each['msg']}" for each in error.errors())
-        return "; ".join(fields)
+        return "; ".join(_refused(".".join(map(str, each["loc"])), each["msg"]) for each in error.errors())
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return None
+
+
+def _refused(field: str, message: str) -> str:
+    reason = message.removeprefix("Value error, ")  # pydantic's words before a sentence of ours
+    return f"{field}: {reason}" if field else reason

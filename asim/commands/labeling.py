@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from asim.commands.console import DEFAULT_URL, Count, Json, Key, ProjectName, Purpose, Strategy, Url, connect
+from asim.errors import AsimError
 
 Wait = Annotated[float, typer.Option(min=0, help="Seconds to wait for a ranked queue.")]
 
@@ -60,15 +61,17 @@ def label(
 ) -> None:
     """Acquire segments and answer them with the project's simulator."""
     from asim.report import Report
-    from asim.simulator_labeling import answer, given, taken
+    from asim.simulator_labeling import answer, given
 
     with connect(url, key) as client, Report() as report:
         found = client.find_project(project)
+        if found.environment.simulator is None:
+            raise AsimError(f"project {found.name} names no simulator: its labels come from elsewhere")
         if acquisition is not None:
-            batches = given(client, found, acquisition, token)
+            batch = given(client, found, acquisition, token)
         else:
-            batches = taken(client, found, count, strategy, purpose, wait)
-        answer(client, batches, seed, report)
+            batch = client.acquire(found.id, count, strategy=strategy, purpose=purpose, labeler="asim label", wait=wait)
+        answer(client, batch, seed, report)
 
 
 def start_round(project: ProjectName, url: Url = DEFAULT_URL, key: Key = None) -> None:

@@ -23,7 +23,7 @@ class GridSubgoalGeneratorConfig:
     code_size: int = 16
     hidden: int = 64
     exploration: float = 0.1  # share of pairs trained with a random code
-    prior_weight: float = 0.1  # of -log p(k|x) in the choice of a pair's code: keeps outcomes from being split up
+    prior_weight: float = 0.02  # of -log p(k|x) in the choice of a pair's code: keeps outcomes from being split up
 
 
 class GridSubgoalGenerator(nn.Module):
@@ -78,7 +78,7 @@ class GridSubgoalGenerator(nn.Module):
         return {name: torch.stack([step[name] for step in chain], 1) for name in ("grid", "carried")}
 
     def _explored(self, best: Tensor, generator: torch.Generator) -> Tensor:
-        """A share of the codes (B,) replaced by random ones: a code that never wins learns what is usual nevertheless."""
+        """A share of the codes (B,) replaced by random ones: a code that never wins still learns what is usual."""
         shape, device = best.shape, generator.device
         swap = torch.rand(shape, generator=generator, device=device) < self.config.exploration
         other = torch.randint(self.config.codes, shape, generator=generator, device=device)

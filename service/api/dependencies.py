@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from ipaddress import ip_address
 from typing import Annotated
 
@@ -34,11 +34,6 @@ class Services:
     def limits(self) -> Limits:
         """Bounds of scorings."""
         return limits_of(self.settings)
-
-
-def utc_now() -> datetime:
-    """The wall clock."""
-    return datetime.now(UTC)
 
 
 def services(request: Request) -> Services:

@@ -1,8 +1,9 @@
 """/jobs and /events."""
 
+from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter, Depends, Query
 from sqlalchemy import select
 
 from api_schemas.base import Page
@@ -31,11 +32,15 @@ def show_job(job_id: UUID, session: ReadSession) -> Job:
 
 @router.get("/events")
 def list_events(
-    session: ReadSession, project: UUID | None = None, cursor: Cursor = None, limit: PageSize = 100
+    session: ReadSession,
+    project: UUID | None = None,
+    newest: Annotated[bool, Query(description="newest first")] = False,
+    cursor: Cursor = None,
+    limit: PageSize = 100,
 ) -> Page[Event]:
     statement = select(EventRow)
     if project is not None:
         projects.find(session, project)
         statement = statement.where(EventRow.project_id == project)
-    rows, after = page(session, statement, (EventRow.id,), cursor, limit)
+    rows, after = page(session, statement, (EventRow.id,), cursor, limit, newest_first=newest)
     return Page(items=[events.describe(row) for row in rows], next=after)

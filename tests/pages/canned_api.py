@@ -171,11 +171,10 @@ def application(api: CannedApi) -> FastAPI:
         return page([each for each in api.jobs if each.project == project])
 
     @app.get("/events", response_model=Page[Event])
-    def events(project: UUID, request: Request, cursor: int = 0, limit: int = 100) -> Page[Event]:
+    def events(project: UUID, request: Request, newest: bool = False, limit: int = 100) -> Page[Event]:
         check(request)
-        after = [each for each in api.events if each.project == project and each.id > cursor]
-        more = len(after) > limit
-        return Page[Event](items=after[:limit], next=str(after[limit - 1].id) if more else None)
+        own = [each for each in api.events if each.project == project]
+        return Page[Event](items=(own[::-1] if newest else own)[:limit], next=None)
 
     return app
 

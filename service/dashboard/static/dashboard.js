@@ -10,7 +10,7 @@ const MAX_WAIT_MS = 30_000;
 const PROJECTS_EVERY = 5; // polls between two listings of all projects
 const SHOWN = { jobs: 20, rounds: 50, events: 30 };
 
-const state = { projects: null, polls: 0, failures: 0, events: null, answers: null, timer: 0, controller: null };
+const state = { projects: null, polls: 0, failures: 0, answers: null, timer: 0, controller: null };
 
 /** The address keeps the choice: #project=ID&compare=ID,ID */
 function choice() {
@@ -23,23 +23,6 @@ function choice() {
 const addressOf = (project, compare) => `#project=${encodeURIComponent(project)}${compare.length ? `&compare=${compare.map(encodeURIComponent).join(",")}` : ""}`;
 
 /** Events come oldest first: large pages up to the newest, then small ones from the last cursor on. */
-async function askEvents(project, signal) {
-  if (state.events?.project !== project) state.events = { project, cursor: null, limit: 1000, byId: new Map() };
-  const seen = state.events;
-  for (let page = 0; page < 20; page += 1) {
-    const answer = await get("events", { project, cursor: seen.cursor, limit: seen.limit }, signal);
-    for (const event of answer.items) seen.byId.set(event.id, event);
-    if (!answer.next) {
-      seen.limit = SHOWN.events;
-      break;
-    }
-    seen.cursor = answer.next;
-  }
-  const newest = [...seen.byId.values()].sort((a, b) => b.id - a.id).slice(0, SHOWN.events);
-  seen.byId = new Map(newest.map((event) => [event.id, event]));
-  return newest;
-}
-
 async function askProject(signal) {
   const { project, compare } = choice();
   const curve = (id) => get("model-error", { project: id }, signal);
@@ -48,10 +31,10 @@ async function askProject(signal) {
     curve(project),
     get("rounds", { project, limit: SHOWN.rounds }, signal),
     get("jobs", { project, limit: SHOWN.jobs }, signal),
-    askEvents(project, signal),
+    get("events", { project, newest: true, limit: SHOWN.events }, signal),
     ...compare.map((id) => curve(id).catch((error) => { if (error instanceof Refused) return { project: id, points: [] }; throw error; })),
   ]);
-  return { about, own, others, rounds: rounds.items, jobs: jobs.items, events };
+  return { about, own, others, rounds: rounds.items, jobs: jobs.items, events: events.items };
 }
 
 async function ask(signal) {

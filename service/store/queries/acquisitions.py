@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import and_, delete, func, or_, select, update
+from sqlalchemy import and_, delete, func, or_, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from service.store.queries.pool import live_claim
@@ -44,9 +44,14 @@ def free_queue(session: Session, scoring: ScoringRow, count: int, now: datetime)
     return session.scalars(statement.order_by(QueueRow.rank).limit(count)).all()
 
 
-def take_claim(session: Session, claim: ClaimRow) -> None:
-    """Write a claim over an expired one of the same segment, if there is one."""
-    session.merge(claim)
+def take_claims(session: Session, claims: Sequence[ClaimRow]) -> None:
+    """Write claims of one project over the expired ones of the same segments, in two statements for any number."""
+    segments = [(claim.trajectory_id, claim.start) for claim in claims]
+    stale = and_(
+        ClaimRow.project_id == claims[0].project_id, tuple_(ClaimRow.trajectory_id, ClaimRow.start).in_(segments)
+    )
+    session.execute(delete(ClaimRow).where(stale).execution_options(synchronize_session=False))
+    session.add_all(claims)
 
 
 def claim_on(session: Session, project_id: UUID, trajectory: str, start: int) -> ClaimRow | None:

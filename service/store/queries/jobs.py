@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import ColumnElement, func, or_, select
+from sqlalchemy import ColumnElement, delete, func, or_, select
 from sqlalchemy.orm import Session
 
 from service.store.tables import JobRow, WorkerRow
@@ -55,6 +55,11 @@ def counts_by_state(session: Session) -> Sequence[tuple[str, str, int]]:
 def live_workers(session: Session, since: datetime) -> int:
     """Workers heard of since then."""
     return session.scalar(select(func.count()).where(WorkerRow.heartbeat_at >= since)) or 0
+
+
+def forget_workers(session: Session, before: datetime) -> None:
+    """Drop the workers that were last heard of before then."""
+    session.execute(delete(WorkerRow).where(WorkerRow.heartbeat_at < before))
 
 
 def _waiting(queues: Sequence[str], now: datetime) -> ColumnElement[bool]:

@@ -1,0 +1,60 @@
+# `make help` lists the targets. Every target makes .venv first and installs what it needs into it.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+export PYTHONSAFEPATH := 1
+SEED ?= 0
+
+.PHONY: help setup system demo serve test test-slow lint types imports format bench-acquire bench-score clean
+.DEFAULT_GOAL := help
+
+help: ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
+
+setup: $(VENV)/.installed ## .venv with everything that demo and test need
+
+$(VENV)/.installed: pyproject.toml constraints.txt scripts/system-packages
+	scripts/system-packages python
+	test -x $(BIN)/python || $$(command -v $(PYTHON) || command -v python3) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	touch $@
+
+system: ## Debian packages for everything, tests included (as root; otherwise prints the command)
+	scripts/system-packages all
+
+demo: setup ## the whole loop on MiniGrid, cycle beside random, no server needed (SEED=n for another seed)
+	$(BIN)/asim demo --seed $(SEED)
+
+serve: setup ## the service on ./asim-data at http://127.0.0.1:8000
+	$(BIN)/asim serve
+
+test: setup lint types imports ## what CI runs: lint, types, import contracts, tests
+	scripts/system-packages all
+	$(BIN)/python -m pytest
+
+test-slow: setup ## the long tests: crashes at random moments
+	$(BIN)/python -m pytest -m slow
+
+lint: setup ## ruff
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: setup ## mypy, strict
+	$(BIN)/mypy
+
+imports: setup ## the arrows between packages
+	$(BIN)/lint-imports
+
+format: setup ## let ruff put the code in form
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench-acquire: setup ## latency of POST /acquire with a ready queue
+	$(BIN)/python -m benchmarks.service.acquire
+
+bench-score: setup ## the scoring job beside the networks' bare forward pass
+	$(BIN)/python -m benchmarks.service.score
+
+clean: ## remove .venv and caches
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache *.egg-info
