@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from asim.commands import labeling, processes, projects
+from asim.commands import keys, labeling, processes, projects
 from asim.commands.console import explain
 
 app = typer.Typer(
@@ -17,6 +17,7 @@ app.command("serve")(processes.serve)
 app.command("worker")(processes.worker)
 app.command("demo")(processes.demo)
 app.add_typer(projects.app, name="project", help="Create, list, show and change projects.")
+app.command("key")(keys.create)
 app.command("collect")(projects.collect)
 app.command("import")(projects.import_files)
 app.command("acquire")(labeling.acquire)

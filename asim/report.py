@@ -10,7 +10,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 Advance = Callable[[float, str], None]  # (share done from 0 to 1, what is going on)
 PLAIN_SECONDS = 15.0  # between two plain lines of the same step
-PLAIN_WIDTH = 110
+PLAIN_WIDTH = 200
 
 
 class Report:

@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import socket
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -15,13 +14,11 @@ from types import FrameType
 import uvicorn
 
 from asim.errors import AsimError
-from asim.supervision import Supervised, Supervisor
-from service.app import create_app
+from asim.runners import runner_processes
+from asim.supervision import Supervisor
 from service.log import configure_logs
 from service.settings import Settings
 
-SCIENCE_QUEUES = "train,score,default"
-COLLECTOR_QUEUES = "label"
 Tell = Callable[[str], None]
 
 
@@ -45,7 +42,12 @@ def serve(settings: Settings, host: str, port: int, runners: int, tell: Tell) ->
     folder = settings.data_folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder), _listening(host, port) as listener, _ended_by_signals():
+        from service.app import create_app  # after the checks: a refusal comes at once
+        from service.store.database import migrate
+
         configure_logs()
+        if not settings.embedded:  # embedded, the service does it by itself
+            migrate(settings.resolved_database_url())
         (folder / "serve.json").unlink(missing_ok=True)  # of one that was killed
         url = _url(host, listener.getsockname()[1])
         supervisor = Supervisor(runner_processes(settings, runners), tell)
@@ -63,36 +65,6 @@ def serve(settings: Settings, host: str, port: int, runners: int, tell: Tell) ->
                 signal.signal(number, signal.SIG_IGN)
             supervisor.stop()
             (folder / "serve.json").unlink(missing_ok=True)
-
-
-def runner_processes(settings: Settings, runners: int) -> list[Supervised]:
-    """The science runners, who cannot reach simulator states, and the collector, who can. None with a broker."""
-    if not settings.embedded:
-        return []
-    science = [
-        Supervised(f"runner {number}", _runner_argv(SCIENCE_QUEUES), runner_environment(settings, SCIENCE_QUEUES))
-        for number in range(1, runners + 1)
-    ]
-    collector = Supervised("collector", _runner_argv(COLLECTOR_QUEUES), runner_environment(settings, COLLECTOR_QUEUES))
-    return [*science, collector]
-
-
-def runner_environment(settings: Settings, queues: str) -> dict[str, str]:
-    """The environment of a runner for `queues`: threads bounded, and no way to provenance unless it collects."""
-    threads = str(settings.torch_threads)
-    environment = {
-        **os.environ,
-        "ASIM_DATA_FOLDER": str(settings.data_folder.absolute()),
-        "OMP_NUM_THREADS": threads,
-        "MKL_NUM_THREADS": threads,
-    }
-    if queues != COLLECTOR_QUEUES:
-        environment["ASIM_PROVENANCE_URL"] = ""
-    return environment
-
-
-def _runner_argv(queues: str) -> list[str]:
-    return [sys.executable, "-m", "workers.runner", "--queues", queues, "--parent", str(os.getpid())]
 
 
 class _Server(uvicorn.Server):

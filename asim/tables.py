@@ -9,7 +9,7 @@ from api_schemas.acquisitions import Acquisition
 from api_schemas.projects import Project
 from api_schemas.rounds import ModelError, ModelErrorCurve
 
-WIDTH_WITHOUT_TERMINAL = 110
+WIDTH_WITHOUT_TERMINAL = 200
 
 
 def show(table: Table) -> None:

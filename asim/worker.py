@@ -4,7 +4,7 @@ import os
 import sys
 
 from asim.errors import AsimError
-from asim.serve import COLLECTOR_QUEUES, runner_environment
+from asim.runners import COLLECTOR_QUEUES, runner_argv, runner_environment
 from service.settings import Settings
 
 QUEUE_NAMES = ("train", "score", "label", "default")
@@ -13,13 +13,14 @@ QUEUE_NAMES = ("train", "score", "label", "default")
 def work(settings: Settings, queues: str) -> None:
     """Do jobs of `queues` until SIGTERM; this process becomes the worker and does not return.
 
-    Raises AsimError for an unknown queue, and for one that mixes collections, which need simulator states, with
-    training and scoring, which must not reach them.
+    Raises AsimError for an unknown queue, for collections, which need simulator states, together with training and
+    scoring, which must not reach them, and for a data folder that was never served.
     """
     names = [name.strip() for name in queues.split(",") if name.strip()]
     _check(names)
+    _check_database(settings)
     environment = runner_environment(settings, ",".join(names))
-    argv = _celery_argv(settings, names) if settings.broker_url else _runner_argv(names)
+    argv = _celery_argv(settings, names) if settings.broker_url else runner_argv(",".join(names))
     sys.stdout.flush()
     os.execve(sys.executable, argv, environment)  # noqa: S606  (no shell: our own module, by the same interpreter)
 
@@ -35,8 +36,9 @@ def _check(names: list[str]) -> None:
         )
 
 
-def _runner_argv(names: list[str]) -> list[str]:
-    return [sys.executable, "-m", "workers.runner", "--queues", ",".join(names)]
+def _check_database(settings: Settings) -> None:
+    if not settings.database_url and not (settings.data_folder / "asim.db").exists():
+        raise AsimError(f"data folder {settings.data_folder.absolute()} holds no database; asim serve makes one")
 
 
 def _celery_argv(settings: Settings, names: list[str]) -> list[str]:

@@ -131,13 +131,13 @@ class GridFamily:
         """One schedule a kind, the same for every strategy."""
         match kind:
             case "world_model":
-                return TrainingConfig(steps=600, batch_size=32, learning_rate=1e-2, weight_decay=1e-4)
+                return TrainingConfig(steps=600, batch_size=32, learning_rate=1e-2, weight_decay=0.5)
             case "inverse_dynamics":
                 return TrainingConfig(steps=400, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
             case "dense_inverse_dynamics":
                 return TrainingConfig(steps=400, batch_size=64, learning_rate=3e-3, weight_decay=1e-3)
             case "subgoal_generator":
-                return TrainingConfig(steps=2000, batch_size=128, learning_rate=3e-3, weight_decay=1e-4)
+                return TrainingConfig(steps=1500, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
         raise ValueError(f"The grid family trains {', '.join(KINDS)}; got {kind!r}.")
 
 

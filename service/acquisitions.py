@@ -153,7 +153,7 @@ def _draw_ranked(
         return scoring
     free = queries.free_queue(session, scoring, count, now)
     if len(free) < count:
-        return scorings.refill(session, scoring, count, now, limits)
+        return scorings.refill(session, project, scoring, count, now, limits)
     candidates = [Candidate(row.trajectory_id, row.start, row.score) for row in free]
     return Draw(scoring.strategy, scoring.round_id, candidates)
 

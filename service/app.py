@@ -26,6 +26,8 @@ def create_app(settings: Settings | None = None, clock: Callable[[], datetime] =
         version=version("asim"),
         summary="Active learning for robot world models: which few segments of your action-free data to label next.",
         lifespan=_lifespan,
+        docs_url=None,  # FastAPI's pages load their scripts from another host
+        redoc_url=None,
     )
     app.state.services = open_services(settings, clock)
     problems.install(app)

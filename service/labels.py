@@ -160,6 +160,8 @@ def _items(project: ProjectRow, upload: LabeledUpload) -> list[LabelItem]:
         raise InvalidLabel(f"{name}.action_sets: length", len(upload.action_sets), f"must be {total}")
     count = pool.segment_count(total, project.segment_length, project.stride)
     starts = range(0, count * project.stride, project.stride) if upload.starts is None else upload.starts
+    for start in starts:
+        _check_start(project, count, start, f"{name}.starts")
     sets = upload.action_sets
     return [
         LabelItem(
@@ -182,13 +184,18 @@ def _member(session: Session, project: ProjectRow, item: LabelItem) -> Membershi
 
 def _check_segment(session: Session, project: ProjectRow, member: MembershipRow, item: LabelItem) -> None:
     name = f"segment {item.trajectory}:{item.start}"
-    number, rest = divmod(item.start, project.stride)
-    if rest or number >= member.segments:
-        last = (member.segments - 1) * project.stride
-        raise InvalidLabel(f"{name}.start", item.start, f"must be a multiple of {project.stride} up to {last}")
+    _check_start(project, member.segments, item.start, f"{name}.start")
     if len(item.actions) != project.segment_length:
         raise InvalidLabel(f"{name}.actions: length", len(item.actions), f"must be {project.segment_length}")
     check_actions(projects.spaces_of(project), item.actions, item.action_sets, name)
+
+
+def _check_start(project: ProjectRow, segments: int, start: int, name: str) -> None:
+    if not segments:
+        raise InvalidLabel(name, start, f"is in a trajectory of less than {project.segment_length} transitions")
+    last = (segments - 1) * project.stride
+    if start % project.stride or not 0 <= start <= last:
+        raise InvalidLabel(name, start, f"must be a multiple of {project.stride} up to {last}")
 
 
 def _check_action(spaces: Spaces, action: Action, name: str) -> None:

@@ -54,8 +54,7 @@ def usable(session: Session, project: ProjectRow, requested: str, now: datetime,
     strategy = requested if current or not NEEDS[requested] else COLD_START_STRATEGY
     round_row = current if NEEDS[strategy] else None
     scoring = queries.newest_scoring(session, project.id, strategy, round_row.id if round_row else None)
-    grown = scoring is not None and scoring.memberships < pool_queries.newest_membership(session, project.id, "pool")
-    if scoring is None or (scoring.status == "ready" and grown and round_row is None):
+    if scoring is None or (scoring.status == "ready" and round_row is None and _outgrown(session, scoring)):
         return _request(session, project, strategy, round_row, now, limits)
     if scoring.status == "ready":
         return scoring
@@ -88,11 +87,19 @@ def start(
     return scoring
 
 
-def refill(session: Session, scoring: ScoringRow, count: int, now: datetime, limits: Limits) -> JobRow:
-    """A job that selects the queue again from the stored scores, long enough for `count`."""
+def refill(
+    session: Session, project: ProjectRow, scoring: ScoringRow, count: int, now: datetime, limits: Limits
+) -> JobRow:
+    """A job that makes the queue long enough for `count`: it selects again from the stored scores.
+
+    Where the pool has outgrown them it is scored again: the free segments may be among those without a score.
+    """
     waiting = job_queries.unfinished(session, scoring.id)
     if waiting is not None:
         return waiting
+    if _outgrown(session, scoring):
+        round_row = session.get(RoundRow, scoring.round_id) if scoring.round_id else None
+        return _waiting(session, start(session, project, scoring.strategy, round_row, now, limits), now, limits)
     payload = SelectQueue(scoring=scoring.id, length=max(limits.queue_length, count))
     return jobs.enqueue(session, scoring.project_id, payload, scoring.id, now, limits.max_attempts)
 
@@ -156,6 +163,10 @@ def _request(
         return waiting or jobs.enqueue(session, project.id, payload, round_row.id, now, limits.max_attempts)
     scoring = start(session, project, strategy, round_row, now, limits)
     return _waiting(session, scoring, now, limits)
+
+
+def _outgrown(session: Session, scoring: ScoringRow) -> bool:
+    return scoring.memberships < pool_queries.newest_membership(session, scoring.project_id, "pool")
 
 
 def _waiting(session: Session, scoring: ScoringRow, now: datetime, limits: Limits) -> JobRow:

@@ -3,7 +3,6 @@
 Where none can be had a test is skipped and says so; with CI set it fails instead.
 """
 
-import glob
 import os
 import pwd
 import shutil
@@ -24,7 +23,10 @@ from redis.exceptions import RedisError
 from sqlalchemy import Engine, create_engine, make_url, text
 from sqlalchemy.exc import OperationalError
 
-POSTGRES_URLS = ("postgresql+psycopg://postgres@127.0.0.1:5432/test", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres")
+POSTGRES_URLS = (
+    "postgresql+psycopg://postgres@127.0.0.1:5432/test",
+    "postgresql+psycopg://postgres@127.0.0.1:5432/postgres",
+)
 REDIS_URL = "redis://127.0.0.1:6379/0"
 START_SECONDS = 20.0
 
@@ -122,7 +124,7 @@ def private_postgres() -> Iterator[str]:
         initialise = [str(programs / "initdb"), "-D", data, "-U", "postgres", "-A", "trust", "--no-sync"]
         subprocess.run(initialise, check=True, user=user, cwd=folder, stdout=subprocess.DEVNULL)
         serve = [str(programs / "postgres"), "-D", data, "-p", str(port), "-h", "127.0.0.1", "-k", folder, "-F"]
-        with open(f"{folder}/log", "wb") as log:
+        with Path(folder, "log").open("wb") as log:
             process = subprocess.Popen(serve, user=user, cwd=folder, stdout=log, stderr=log)
         url = f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres"
         try:
@@ -166,8 +168,8 @@ def _in_server(url: str, statement: str) -> None:
 def _postgres_folder() -> Path | None:
     """Where initdb is; Debian keeps it out of the path."""
     found = shutil.which("initdb")
-    places = [found] if found else sorted(glob.glob("/usr/lib/postgresql/*/bin/initdb"))
-    return Path(places[-1]).resolve().parent if places else None
+    places = [Path(found)] if found else sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    return places[-1].resolve().parent if places else None
 
 
 def _unprivileged_user() -> str | None:

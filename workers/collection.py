@@ -5,7 +5,6 @@ The actions are known only while the behavior runs. They are not stored, except 
 
 import json
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +25,7 @@ from workers.simulators.base import Behavior, Simulator
 from workers.simulators.catalog import make_behavior, make_simulator
 
 BATCH = 25  # trajectories a transaction
+REPEATS = 1000  # episodes in a row that were seen before: the simulator has nothing new to show
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,14 @@ def run_collection(job: RunningJob, asked: CollectionCreate, provenance: Provena
     simulator = make_simulator(environment.simulator or "", environment.options)
     behavior = make_behavior(asked.behavior, simulator)
     quota = _Quota(project, asked)
-    done, batch, seen = 0, [], set[str]()
-    for episode in _episodes(simulator, behavior, asked):
+    rng = np.random.default_rng(asked.seed)
+    done, batch, seen, repeats = 0, [], set[str](), 0
+    while done < asked.transitions and not quota.met and repeats < REPEATS:
+        job.report(done / asked.transitions, f"collected {done} of {asked.transitions} transitions")
+        episode = _episode(simulator, behavior, rng, asked.transitions - done)
         identity = codec.content_id(episode.observations)
-        if identity in seen:
+        repeats = repeats + 1 if identity in seen else 0
+        if repeats:
             continue
         seen.add(identity)
         batch.append((episode, quota.take(episode)))
@@ -64,9 +68,6 @@ def run_collection(job: RunningJob, asked: CollectionCreate, provenance: Provena
         if len(batch) == BATCH:
             _store(job, project, asked, batch, provenance)
             batch = []
-        job.report(min(1.0, done / asked.transitions), f"collected {done} of {asked.transitions} transitions")
-        if done >= asked.transitions or quota.met:
-            break
     _store(job, project, asked, batch, provenance)
     simulator.close()
     return {"trajectories": len(seen), "transitions": done, "labels": dict(quota.taken), "short_of": quota.missing()}
@@ -106,17 +107,8 @@ class _Quota:
         return self.names[action] if self.names else str(action)
 
 
-def _episodes(simulator: Simulator, behavior: Behavior, asked: CollectionCreate) -> Iterator[Episode]:
-    """Episodes without end; the last one is cut so that the collection has as many transitions as were asked for."""
-    rng = np.random.default_rng(asked.seed)
-    left = asked.transitions
-    while True:
-        episode = _episode(simulator, behavior, rng, left)
-        left -= episode.transitions
-        yield episode
-
-
 def _episode(simulator: Simulator, behavior: Behavior, rng: np.random.Generator, most: int) -> Episode:
+    """The next episode, cut after `most` transitions so that a collection is as long as was asked for."""
     seed = int(rng.integers(2**31))
     observations, states = [simulator.reset(seed)], [simulator.state()]
     actions: list[int] = []

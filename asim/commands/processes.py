@@ -23,7 +23,7 @@ def serve(
     """Serve the API and the dashboard, with the runners that do the jobs, until Ctrl-C."""
     from asim.serve import serve as serve_until_signal
 
-    serve_until_signal(_settings(data), host, port, runners, tell=_tell)
+    serve_until_signal(settings_of(data), host, port, runners, tell=_tell)
 
 
 def worker(
@@ -35,7 +35,7 @@ def worker(
     """Do jobs in this process: as a Celery worker where ASIM_BROKER_URL is set, else on the data folder's database."""
     from asim.worker import work
 
-    work(_settings(data), queues)
+    work(settings_of(data), queues)
 
 
 def demo(
@@ -48,7 +48,8 @@ def demo(
     run_demo(seed, keep)
 
 
-def _settings(data: Path | None) -> "Settings":
+def settings_of(data: Path | None) -> "Settings":
+    """The environment's settings, on this data folder if one is named."""
     from service.settings import Settings
 
     return Settings() if data is None else Settings(data_folder=data)

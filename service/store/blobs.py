@@ -64,7 +64,7 @@ def _open_store(url: str) -> LocalStore | S3Store | MemoryStore:
     if "://" not in url:
         Path(url).mkdir(parents=True, exist_ok=True)
         return LocalStore(prefix=url)
-    store = from_url(url)
+    store = from_url(url) if url.startswith(("s3://", "file://", "memory://")) else None
     if not isinstance(store, LocalStore | S3Store | MemoryStore):
         raise ValueError(f"blobs_url: {url!r} is neither a folder nor s3://")
     return store

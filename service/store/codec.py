@@ -85,6 +85,6 @@ def _header(data: bytes, source: str) -> dict[str, Any]:
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["asim"])
     except (ValueError, KeyError, TypeError) as error:
         raise ForeignFile(source, "is not an ASIM trajectory object") from error
-    if header.get("format") != FORMAT or header.get("version") != VERSION:
-        raise ForeignFile(source, f"has format {header.get('format')!r} version {header.get('version')!r}")
-    return dict(header)
+    if not isinstance(header, dict) or (header.get("format"), header.get("version")) != (FORMAT, VERSION):
+        raise ForeignFile(source, f"says that it is {str(header)[:80]}, not {FORMAT} version {VERSION}")
+    return header

@@ -1,16 +1,23 @@
 """The commands against a running service: what they print, and what a mistake costs the user: one sentence."""
 
 import json
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import pytest
 
+from asim.cli import main
 from asim.client import Client
+
+
+class Asim(Protocol):
+    """The command line in this process."""
+
+    def __call__(self, *arguments: str, status: int = 0) -> str: ...
+
 
 SPACES = {
     "observations": {"grid": {"dtype": "uint8", "shape": [6, 6, 3]}, "carried": {"dtype": "uint8", "shape": [3]}},
@@ -18,12 +25,20 @@ SPACES = {
 }
 
 
-def asim(url: str, *arguments: str, status: int = 0) -> str:
-    argv = [sys.executable, "-m", "asim", *arguments]
-    environment = {**os.environ, "ASIM_URL": url, "COLUMNS": "200"}
-    done = subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == status, done.stdout + done.stderr
-    return done.stdout if status == 0 else done.stderr
+@pytest.fixture
+def asim(url: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Asim:
+    """Runs one command; returns what it printed, on stderr where it has to fail."""
+    monkeypatch.setenv("ASIM_URL", url)
+
+    def run(*arguments: str, status: int = 0) -> str:
+        monkeypatch.setattr(sys, "argv", ["asim", *arguments])
+        with pytest.raises(SystemExit) as end:
+            main()
+        printed, complained = capsys.readouterr()
+        assert (end.value.code or 0) == status, printed + complained
+        return printed if status == 0 else complained
+
+    return run
 
 
 def recording(path: Path, seed: int, *, labeled: bool) -> Path:
@@ -39,23 +54,25 @@ def recording(path: Path, seed: int, *, labeled: bool) -> Path:
 
 
 @pytest.fixture
-def own(url: str, tmp_path: Path) -> str:
+def own(asim: Asim, tmp_path: Path) -> str:
     """A project of the user's own environment, named after the test's folder."""
     (tmp_path / "spaces.json").write_text(json.dumps(SPACES))
-    asim(url, "project", "create", tmp_path.name, "--spaces", str(tmp_path / "spaces.json"), "--round-labels", "0")
+    asim("project", "create", tmp_path.name, "--spaces", str(tmp_path / "spaces.json"), "--round-labels", "0")
     return tmp_path.name
 
 
-def test_recordings_are_imported_once_and_labeled_ones_with_their_labels(url: str, own: str, tmp_path: Path) -> None:
+def test_recordings_are_imported_once_and_labeled_ones_with_their_labels(
+    asim: Asim, url: str, own: str, tmp_path: Path
+) -> None:
     plain = [str(recording(tmp_path / f"{seed}.npz", seed, labeled=False)) for seed in range(3)]
     labeled = str(recording(tmp_path / "labeled.npz", 9, labeled=True))
-    printed = asim(url, "import", own, *plain, labeled, "--split", "pool")
+    printed = asim("import", own, *plain, labeled, "--split", "pool")
     assert printed.count(": created ") == 3
     assert "1 labeled files: 12 labels, 0 known before" in printed
-    again = asim(url, "import", own, *plain, labeled, "--split", "pool")
+    again = asim("import", own, *plain, labeled, "--split", "pool")
     assert again.count(": duplicate ") == 3
     assert "0 labels, 12 known before" in again
-    counts = json.loads(asim(url, "project", "show", own))["counts"]
+    counts = json.loads(asim("project", "show", own))["counts"]
     assert (counts["pool_trajectories"], counts["pool_segments"], counts["labeled"]) == (4, 48, 12)
     with Client(url) as client, np.load(labeled) as file:
         project = client.find_project(own)
@@ -63,13 +80,13 @@ def test_recordings_are_imported_once_and_labeled_ones_with_their_labels(url: st
         assert stored == {start: [action] for start, action in enumerate(file["actions"].tolist())}
 
 
-def test_a_policy_is_changed_field_by_field(url: str, own: str) -> None:
-    policy = json.loads(asim(url, "project", "set", own, "--strategy", "random", "--label-budget", "5"))
+def test_a_policy_is_changed_field_by_field(asim: Asim, own: str) -> None:
+    policy = json.loads(asim("project", "set", own, "--strategy", "random", "--label-budget", "5"))
     assert (policy["strategy"], policy["label_budget"], policy["round_labels"]) == ("random", 5, 0)
-    assert re.search(rf"{own} .* random .* 5\b", asim(url, "project", "list"))
+    assert re.search(rf"{own} .* random .* 5\b", asim("project", "list"))
 
 
-def test_mistakes_cost_one_sentence(url: str, own: str, tmp_path: Path) -> None:
+def test_mistakes_cost_one_sentence(asim: Asim, own: str, tmp_path: Path) -> None:
     (tmp_path / "text.npz").write_text("no npz")
     mistakes = {
         ("project", "show", "nothing"): "no project is named 'nothing'",
@@ -87,19 +104,19 @@ def test_mistakes_cost_one_sentence(url: str, own: str, tmp_path: Path) -> None:
         ("error", own, "nothing"): "no project is named 'nothing'",
     }
     for arguments, sentence in mistakes.items():
-        said = asim(url, *arguments, status=1)
+        said = asim(*arguments, status=1)
         assert sentence in said, (arguments, said)
         assert said.startswith("asim: ")
         assert said.count("\n") == 1, said
 
 
-def test_where_nothing_listens_the_url_is_named(tmp_path: Path) -> None:
-    said = asim("http://127.0.0.1:9", "project", "list", status=1)
+def test_where_nothing_listens_the_url_is_named(asim: Asim) -> None:
+    said = asim("project", "list", "--url", "http://127.0.0.1:9", status=1)
     assert said.startswith("asim: no answer from http://127.0.0.1:9 to GET /projects")
 
 
-def test_the_error_of_a_project_without_rounds_is_an_empty_table(url: str, own: str, tmp_path: Path) -> None:
+def test_the_error_of_a_project_without_rounds_is_an_empty_table(asim: Asim, own: str, tmp_path: Path) -> None:
     picture = tmp_path / "curve.png"
-    assert "test loss" in asim(url, "error", own, "--plot", str(picture))
+    assert "test loss" in asim("error", own, "--plot", str(picture))
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert json.loads(asim(url, "error", own, "--json"))["points"] == []
+    assert json.loads(asim("error", own, "--json"))["points"] == []

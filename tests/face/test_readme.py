@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 README = Path(__file__).parents[2] / "README.md"
 
 
@@ -32,6 +34,7 @@ def test_the_curl_walk_through_works_as_printed_and_its_error_falls(url: str, tm
     assert losses[120] < losses[60]
 
 
+@pytest.mark.slow
 def test_the_python_walk_through_works_as_printed_and_its_error_falls(url: str, tmp_path: Path) -> None:
     program = block("python").replace("http://127.0.0.1:8000", url)
     printed = run([sys.executable, "-c", program], url, tmp_path)

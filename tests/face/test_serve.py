@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from asim.client import Client
-from asim.serve import COLLECTOR_QUEUES, SCIENCE_QUEUES, runner_environment, runner_processes
+from asim.errors import AsimError
+from asim.runners import COLLECTOR_QUEUES, SCIENCE_QUEUES, runner_environment, runner_processes
 from asim.served import served
 from service.settings import Settings
 
@@ -38,9 +39,9 @@ def eventually(holds: Callable[[], bool], seconds: float = 20.0) -> bool:
 
 
 def children(pid: int) -> set[int]:
-    return {int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()} | {
-        int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()
-    }
+    """Process ids; a child belongs to the thread that started it."""
+    threads = Path(f"/proc/{pid}/task").iterdir()
+    return {int(child) for thread in threads for child in (thread / "children").read_text().split()}
 
 
 def alive(pid: int) -> bool:
@@ -71,29 +72,31 @@ def test_a_host_that_others_reach_is_refused(host: str, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_killed_service_leaves_no_runner_behind_and_its_folder_free(tmp_path: Path) -> None:
-    with pytest.raises(ProcessLookupError), served(tmp_path):
-        first = pid_of(tmp_path)
-        assert eventually(lambda: len(children(first)) == 2)
-        runners = children(first)
-        os.kill(first, signal.SIGKILL)
-        assert eventually(lambda: not any(map(alive, runners)))
-        raise ProcessLookupError
-    with served(tmp_path) as url, Client(url) as client:
-        assert client.health().database
-
-
-def test_a_killed_runner_is_replaced_and_sigterm_ends_all(tmp_path: Path) -> None:
-    with served(tmp_path) as url, Client(url) as client:
-        service = pid_of(tmp_path)
-        assert eventually(lambda: client.health().workers_alive == 2)
-        before = children(service)
-        os.kill(min(before), signal.SIGKILL)
-        assert eventually(lambda: len(children(service)) == 2 and children(service) != before)
-        runners = children(service)
+def test_a_killed_service_leaves_no_runner_behind_and_starts_again_until_sigterm_ends_all(tmp_path: Path) -> None:
+    with served(tmp_path):
+        killed = pid_of(tmp_path)
+        assert eventually(lambda: len(children(killed)) == 2)
+        orphans = children(killed)
+        os.kill(killed, signal.SIGKILL)
+        assert eventually(lambda: not any(map(alive, orphans)))
+    with served(tmp_path):
+        assert pid_of(tmp_path) != killed
+        assert eventually(lambda: len(children(pid_of(tmp_path))) == 2)
+        runners = children(pid_of(tmp_path))
     assert not any(map(alive, runners))
     assert not (tmp_path / "serve.json").exists()
-    assert "ended with status -9; it starts again in 0.2 s" in (tmp_path / "serve.log").read_text()
+
+
+def test_a_killed_runner_is_replaced(url: str, served_folder: Path) -> None:
+    def collector() -> set[int]:
+        return {pid for pid in children(pid_of(served_folder)) if b"label" in Path(f"/proc/{pid}/cmdline").read_bytes()}
+
+    with Client(url) as client:
+        assert eventually(lambda: client.health().workers_alive == 2)
+    (first,) = collector()
+    os.kill(first, signal.SIGKILL)
+    assert eventually(lambda: bool(collector() - {first}))
+    assert "collector ended with status -9; it starts again in 0.2 s" in (served_folder / "serve.log").read_text()
 
 
 def test_only_the_collector_can_reach_simulator_states(tmp_path: Path) -> None:
@@ -108,3 +111,16 @@ def test_only_the_collector_can_reach_simulator_states(tmp_path: Path) -> None:
 def test_a_worker_that_would_mix_collecting_with_training_is_refused(tmp_path: Path) -> None:
     assert "queues: train,label mixes label" in refusal("worker", "--data", str(tmp_path), "--queues", "train,label")
     assert "queues: trian given; known are" in refusal("worker", "--data", str(tmp_path), "--queues", "trian")
+
+
+def test_a_worker_of_a_folder_that_was_never_served_is_refused(tmp_path: Path) -> None:
+    assert f"data folder {tmp_path} holds no database" in refusal("worker", "--data", str(tmp_path))
+
+
+def test_a_service_that_cannot_start_says_why_to_the_one_who_started_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ASIM_JOB_LEASE_SECONDS", "-1")
+    with pytest.raises(AsimError, match=r"(?s)ended with status 1.*job_lease_seconds: .* greater than 0"):  # noqa: SIM117
+        with served(tmp_path):
+            pytest.fail("it cannot have started")

@@ -52,12 +52,14 @@ def membership(session: Session, project_id: UUID, trajectory_id: str) -> Member
 
 
 def memberships(
-    session: Session, project_id: UUID, split: str, first: int = 0, last: int = 2**62
+    session: Session, project_id: UUID, split: str, first: int = 0, last: int | None = None
 ) -> Sequence[MembershipRow]:
     """Members of a split in the order they came, by id from `first` to `last`."""
     statement = select(MembershipRow).where(
-        MembershipRow.project_id == project_id, MembershipRow.split == split, MembershipRow.id.between(first, last)
+        MembershipRow.project_id == project_id, MembershipRow.split == split, MembershipRow.id >= first
     )
+    if last is not None:
+        statement = statement.where(MembershipRow.id <= last)
     return session.scalars(statement.order_by(MembershipRow.id)).all()
 
 

@@ -1,0 +1,212 @@
+"""A service under test: the app, a worker in the same process, a clock that both read; rooms and robots to feed it."""
+
+import io
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Any
+from uuid import UUID, uuid4
+
+import numpy as np
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from httpx2 import Response
+from numpy.typing import NDArray
+
+from api_schemas.errors import PROBLEM_JSON, Problem
+from service.api.dependencies import Services
+from service.app import create_app
+from service.settings import Settings
+from workers.dispatch import open_worker, run_next
+from workers.job import Worker
+
+Arrays = dict[str, NDArray[Any]]
+Json = dict[str, Any]
+ROOM: Json = {"simulator": "minigrid"}
+ROBOT: Json = {
+    "spaces": {
+        "observations": {
+            "front": {"dtype": "uint8", "shape": (64, 64, 3)},
+            "wrist": {"dtype": "uint8", "shape": (64, 64, 3)},
+            "proprioception": {"dtype": "float32", "shape": (9,)},
+        },
+        "actions": {"kind": "box", "shape": (7,), "low": -1.0, "high": 1.0},
+    }
+}
+
+
+class Clock:
+    """Stands still but for a microsecond a reading, until it is told to advance."""
+
+    def __init__(self) -> None:
+        self.now = datetime(2026, 1, 1, tzinfo=UTC)
+        self._lock = threading.Lock()
+
+    def __call__(self) -> datetime:
+        with self._lock:
+            self.now += timedelta(microseconds=1)
+            return self.now
+
+    def advance(self, seconds: float) -> None:
+        with self._lock:
+            self.now += timedelta(seconds=seconds)
+
+
+@dataclass
+class Served:
+    """One service and the calls that tests make of it."""
+
+    settings: Settings
+    clock: Clock
+    app: FastAPI
+    client: TestClient
+    workers: dict[tuple[str, ...], Worker] = field(default_factory=dict)
+
+    @property
+    def services(self) -> Services:
+        held: Services = self.app.state.services
+        return held
+
+    def worker(self, *queues: str) -> Worker:
+        """A worker of these queues, opened once."""
+        if queues not in self.workers:
+            self.workers[queues] = open_worker(self.settings, self.clock, queues)
+        return self.workers[queues]
+
+    def drain(self, *queues: str) -> int:
+        """Run the jobs that wait in the queues, and those that they ask for; returns how many ran."""
+        ran = 0
+        while run_next(self.worker(*(queues or ("score",)))):
+            ran += 1
+        return ran
+
+    def project(self, **fields: Any) -> str:
+        """A new project in which every trajectory is in the pool and no round starts by itself."""
+        policy = {"round_labels": 0} | fields.pop("policy", {})
+        defaults = {"name": uuid4().hex, "environment": ROOM, "held_out_fraction": 0.0}
+        answer = self.client.post("/projects", json=defaults | fields | {"policy": policy})
+        assert answer.status_code == 201, answer.text
+        return str(answer.json()["id"])
+
+    def show(self, project: str) -> Json:
+        """The project as it stands."""
+        return self.get(f"/projects/{project}")
+
+    def get(self, path: str, **query: Any) -> Json:
+        """JSON of a page that must be there."""
+        answer = self.client.get(path, params=query)
+        assert answer.status_code == 200, answer.text
+        return dict(answer.json())
+
+    def send(self, project: str, files: Sequence[tuple[str, bytes]], **query: Any) -> Response:
+        """Upload raw files."""
+        return self.client.post(
+            "/trajectories", params={"project": project} | query, files=[("files", file) for file in files]
+        )
+
+    def upload(self, project: str, *trajectories: Mapping[str, NDArray[Any]], **query: Any) -> list[Json]:
+        """Receipts of the trajectories."""
+        files = [(f"{number}.npz", npz(arrays)) for number, arrays in enumerate(trajectories)]
+        answer = self.send(project, files, **query)
+        assert answer.status_code == 201, answer.text
+        return list(answer.json()["items"])
+
+    def ask(self, project: str, count: int = 1, **fields: Any) -> Response:
+        """POST /acquire as it answers."""
+        return self.client.post("/acquire", json={"project": project, "count": count} | fields)
+
+    def acquire(self, project: str, count: int = 1, **fields: Any) -> Json:
+        """A batch, after the scoring that it may have to wait for."""
+        answer = self.ask(project, count, **fields)
+        if answer.status_code == 202:
+            self.drain()
+            answer = self.ask(project, count, **fields)
+        assert answer.status_code == 201, answer.text
+        return dict(answer.json())
+
+    def label(self, project: str, items: Sequence[Json], batch: Json | None = None, **fields: Any) -> Response:
+        """POST /labels, under the batch's lease where one is given."""
+        lease = {} if batch is None else {"acquisition": batch["id"], "token": batch["token"]}
+        return self.client.post("/labels", json={"project": project, "items": list(items)} | lease | fields)
+
+    def close(self) -> None:
+        """Give back all connections."""
+        self.client.close()
+        self.services.database.close()
+        for worker in self.workers.values():
+            worker.database.close()
+
+
+def serve(settings: Settings, clock: Clock | None = None) -> Served:
+    """The service on these settings."""
+    clock = clock or Clock()
+    app = create_app(settings, clock)
+    return Served(settings, clock, app, TestClient(app, base_url="http://127.0.0.1"))
+
+
+def room(seed: int, transitions: int = 5, size: int = 6) -> Arrays:
+    """A trajectory in the MiniGrid code; its cells are drawn by chance, which no part of the service minds."""
+    rng = np.random.default_rng(seed)
+    grid = rng.integers(0, (11, 6, 5), (transitions + 1, size, size, 3)).astype(np.uint8)
+    return {"grid": grid, "carried": rng.integers(0, (11, 6, 5), (transitions + 1, 3)).astype(np.uint8)}
+
+
+def robot(seed: int, transitions: int = 11) -> Arrays:
+    """A trajectory of two cameras and proprioception."""
+    rng = np.random.default_rng(seed)
+    cameras = {name: rng.integers(0, 256, (transitions + 1, 64, 64, 3), np.uint8) for name in ("front", "wrist")}
+    return cameras | {"proprioception": rng.normal(size=(transitions + 1, 9)).astype(np.float32)}
+
+
+def npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """The arrays as a file."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **dict(arrays))
+    return buffer.getvalue()
+
+
+def unpack(data: bytes) -> Arrays:
+    """The arrays of a file."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def answers(batch: Json, action: Any = 0) -> list[Json]:
+    """The same action for every step of every item of a batch."""
+    return [
+        {"trajectory": item["trajectory"], "start": item["start"], "actions": [action] * item["length"]}
+        for item in batch["items"]
+    ]
+
+
+def segments(batch: Json) -> list[tuple[str, int]]:
+    """What a batch offers, in order."""
+    return [(item["trajectory"], item["start"]) for item in batch["items"]]
+
+
+def refused(answer: Response, status: int, kind: str, *words: object) -> Json:
+    """The problem that a refusal answers with, checked: whole, of this kind, its sentence with these words."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == PROBLEM_JSON
+    problem = Problem.model_validate(answer.json())
+    assert problem.type == f"urn:asim:error:{kind}", answer.text
+    assert problem.status == status
+    assert problem.title
+    assert not problem.title.endswith(".")
+    for word in words:
+        assert str(word) in problem.detail, problem.detail
+    return dict(answer.json())
+
+
+def same(found: Mapping[str, NDArray[Any]], expected: Mapping[str, NDArray[Any]]) -> bool:
+    """Equal names, dtypes, shapes and bytes."""
+    return sorted(found) == sorted(expected) and all(
+        found[name].dtype == array.dtype
+        and found[name].shape == array.shape
+        and found[name].tobytes() == np.ascontiguousarray(array).tobytes()
+        for name, array in expected.items()
+    )
+
+
+UNKNOWN = str(UUID(int=4711))

@@ -1,0 +1,332 @@
+"""A round stores each stage as it is done, survives whatever happens between two of them, and never spoils the last."""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from api_schemas.rounds import Round
+from models import checkpoints
+from models.families import GRID
+from models.training import TrainingResult
+from service import reaper, registry
+from service.errors import MissingBlob
+from service.store.tables import ModelVersionRow, ScoringRow
+from tests.workers.conftest import OpenLoop, new_project
+from tests.workers.in_process import Loop, segments_of
+from workers import data, training
+from workers.dispatch import run_job, run_next
+from workers.training import BASE
+
+Train = Callable[..., TrainingResult]
+STAGES = ["inverse_dynamics", "world_model", "evaluation"]
+
+
+def hashes(loop: Loop, of: Round) -> dict[str, str]:
+    """By stage, the hash of the weights that a round has registered."""
+    return {name: loop.client.model(model).sha256 for name, model in of.models.items()}
+
+
+def start(loop: Loop) -> Round:
+    """A round whose job waits."""
+    return loop.client.start_round(loop.project.id)
+
+
+def interrupt(patch: pytest.MonkeyPatch, number: int, action: Callable[[], None], name: str = "train") -> list[int]:
+    """Call `action` instead of the `number`-th call of workers.training's `name`; returns the counted calls."""
+    real: Train = getattr(training, name)
+    calls: list[int] = []
+
+    def counted(*args: Any, **kwargs: Any) -> Any:
+        calls.append(len(calls) + 1)
+        if calls[-1] == number:
+            action()
+        return real(*args, **kwargs)
+
+    patch.setattr(training, name, counted)
+    return calls
+
+
+def disk_is_full() -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_round_stores_its_stages_and_becomes_current(labeled: Loop) -> None:
+    done = labeled.train()
+    assert [stage.name for stage in done.stages] == STAGES
+    assert (done.status, done.error, done.labels, done.number) == ("current", None, 60, 1)
+    assert set(done.models) == BASE
+    assert labeled.project.current_round == done.id
+    assert done.watermark == labeled.project.label_watermark
+
+
+def test_registered_hashes_are_those_of_the_weights(trained: Loop) -> None:
+    for model in trained.client.models(trained.project.id):
+        weights = trained.client.weights(model.id)
+        assert hashlib.sha256(weights).hexdigest() == model.sha256
+        assert len(weights) == model.bytes
+        assert checkpoints.load(weights, expect_kind=model.kind, expect_family="grid").kind == model.kind
+
+
+def test_model_error_covers_the_held_out_labels(trained: Loop) -> None:
+    (point,) = trained.client.model_error(trained.project.id).points
+    error = point.model_error
+    assert error.transitions == trained.project.counts.held_out_labeled == 14
+    assert {name: group.transitions for name, group in error.by_group.items()} == {"movement": 6, "interaction": 8}
+    assert error.loss is not None
+    assert error.loss > 0
+
+
+def test_without_held_out_labels_there_is_no_model_error(empty: Loop) -> None:
+    empty.collect(200, seed=1, split="pool")
+    empty.label(20, "random")
+    error = empty.train().model_error
+    assert error is not None
+    assert (error.transitions, error.loss, error.dynamics_accuracy, error.inverse_accuracy) == (0, None, None, None)
+
+
+def test_a_job_that_is_brought_twice_runs_once(trained: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = interrupt(monkeypatch, 1, pytest.fail)
+    (job,) = trained.jobs("train_round")
+    assert not run_job(trained.worker, job.id)
+    assert calls == []
+
+
+def test_a_finished_job_that_runs_again_trains_and_scores_nothing(
+    trained: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (job,) = trained.jobs("train_round")
+    (before,) = trained.client.rounds(trained.project.id)
+    trained.requeue(job.id)
+    calls = interrupt(monkeypatch, 1, pytest.fail)
+    assert trained.drain() == 1
+    (after,) = trained.client.rounds(trained.project.id)
+    assert (after.models, after.stages, after.status) == (before.models, before.stages, "current")
+    assert calls == []
+    assert len(trained.jobs("score_shard")) == len(trained.jobs("merge_scores")) == 2  # the seeds' and the round's
+
+
+@pytest.mark.parametrize("name", ["train", "model_error"])
+def test_a_crash_keeps_the_stages_before_it(
+    labeled: Loop, trained: Loop, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    asked = start(labeled)
+    calls = interrupt(monkeypatch, 2 if name == "train" else 1, disk_is_full, name)
+    labeled.drain()
+    crashed = labeled.client.round(asked.id)
+    (job,) = labeled.jobs("train_round")
+    kept = STAGES[: 1 if name == "train" else 2]
+    assert [stage.name for stage in crashed.stages] == list(crashed.models) == sorted(crashed.models) == kept
+    assert (job.state, job.attempts, job.error) == ("queued", 1, "OSError: [Errno 28] No space left on device")
+    labeled.clock.advance(10)
+    labeled.drain()
+    resumed = labeled.client.round(asked.id)
+    assert resumed.status == "current"
+    assert [stage.name for stage in resumed.stages] == STAGES
+    assert all(resumed.models[stage] == crashed.models[stage] for stage in kept)
+    assert len(calls) == (3 if name == "train" else 2)
+    assert hashes(labeled, resumed) == hashes(trained, next(trained.client.rounds(trained.project.id)))
+
+
+def test_weights_without_a_row_are_trained_again(labeled: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, calls = registry.register, []
+
+    def register(*args: Any) -> ModelVersionRow:
+        calls.append(args)
+        if len(calls) == 2:
+            disk_is_full()
+        return real(*args)
+
+    monkeypatch.setattr(registry, "register", register)
+    asked = start(labeled)
+    labeled.drain()
+    assert list(labeled.client.round(asked.id).models) == ["inverse_dynamics"]
+    labeled.clock.advance(10)
+    labeled.drain()
+    assert set(labeled.client.round(asked.id).models) == BASE
+
+
+def test_a_worker_that_stops_gives_the_round_back_uncounted(labeled: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = start(labeled)
+    calls = interrupt(monkeypatch, 2, labeled.worker.stopping.set)
+    run_next(labeled.worker)
+    (job,) = labeled.jobs("train_round")
+    assert (job.state, job.attempts, job.error) == ("queued", 0, None)
+    assert list(labeled.client.round(asked.id).models) == ["inverse_dynamics"]
+    labeled.drain(labeled.another_worker())
+    assert labeled.client.round(asked.id).status == "current"
+    assert len(calls) == 3  # the stopped stage again
+
+
+def test_what_a_silent_worker_writes_after_its_lease_is_refused(
+    labeled: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = start(labeled)
+
+    def another_finishes_it() -> None:
+        labeled.clock.advance(100)
+        with labeled.worker.database.write() as session:
+            reaper.reap(session, labeled.clock())
+        labeled.clock.advance(2)
+        labeled.drain(labeled.another_worker())
+
+    calls = interrupt(monkeypatch, 1, another_finishes_it)
+    run_next(labeled.worker)
+    done = labeled.client.round(asked.id)
+    (job,) = labeled.jobs("train_round")
+    assert (done.status, [stage.name for stage in done.stages]) == ("current", STAGES)
+    assert (job.state, job.attempts) == ("done", 2)
+    assert len(calls) == 3
+    assert len({model.id for model in labeled.client.models(labeled.project.id) if model.round == asked.id}) == 2
+
+
+def test_a_round_whose_attempts_are_used_up_fails_and_the_older_one_stays(
+    opened: OpenLoop, trained_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = opened(trained_folder, job_max_attempts=2)
+    before = loop.project.current_round
+    loop.label(5)
+    monkeypatch.setattr(training, "train", lambda *_: disk_is_full())
+    asked = start(loop)
+    for _ in range(3):
+        loop.drain()
+        loop.clock.advance(100)
+    failed, job = loop.client.round(asked.id), loop.jobs("train_round")[-1]
+    assert (failed.status, job.state, job.attempts) == ("failed", "failed", 2)
+    assert failed.error == f"job {job.id} (train_round): OSError: [Errno 28] No space left on device"
+    assert loop.project.current_round == before
+    assert loop.acquire(3).round == before
+
+
+def test_a_worker_that_dies_every_time_fails_the_round(labeled: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = start(labeled)
+
+    class KilledError(BaseException):
+        pass
+
+    def die(*_: Any) -> None:
+        raise KilledError
+
+    monkeypatch.setattr(training, "train", die)
+    for _ in range(5):
+        with pytest.raises(KilledError):
+            run_next(labeled.worker)
+        labeled.clock.advance(100)
+        with labeled.worker.database.write() as session:
+            reaper.reap(session, labeled.clock())
+        labeled.clock.advance(100)
+    failed = labeled.client.round(asked.id)
+    assert failed.status == "failed"
+    assert failed.error is not None
+    assert "fell silent in attempt 5 of 5" in failed.error
+
+
+def test_projects_of_equal_seed_and_data_start_alike(empty: Loop) -> None:
+    empty.collect(50, seed=9, split="pool")  # so that the rows of the two projects are numbered apart
+    seeds, weights = [], []
+    for name in ("one", "two"):
+        empty.name = name
+        new_project(empty, seed=7)
+        empty.collect(200, seed=1, split="pool")
+        seeds.append(segments_of(empty.label(20, "random", seed=4)))
+        weights.append(hashes(empty, empty.train()))
+    assert seeds[0] == seeds[1]
+    assert weights[0] == weights[1]
+
+
+def test_projects_of_another_seed_start_otherwise(opened: OpenLoop) -> None:
+    seeds = []
+    for seed in (7, 8):
+        loop = opened()
+        new_project(loop, seed=seed)
+        loop.collect(200, seed=1, split="pool")
+        seeds.append(segments_of(loop.acquire(20, "random")))
+    assert set(seeds[0]) != set(seeds[1])
+
+
+def foreign_kind(loop: Loop) -> bytes:
+    """The weights of another kind of network."""
+    (model,) = (m for m in loop.client.models(loop.project.id) if m.kind == "subgoal_generator")
+    return loop.client.weights(model.id)
+
+
+def foreign_family(loop: Loop) -> bytes:
+    """A checkpoint that says that it is of another family."""
+    network = GRID.build_world_model(data.model_spaces(loop.project.environment.resolved_spaces()), None, _generator())
+    network.family = "tree"
+    return checkpoints.save(network)
+
+
+@pytest.mark.parametrize(
+    ("blob", "sentence"),
+    [
+        (foreign_kind, "CheckpointError: Expected a checkpoint of kind 'world_model', found kind 'subgoal_generator'."),
+        (foreign_family, "CheckpointError: Expected a checkpoint of family 'grid', found family 'tree'."),
+    ],
+)
+def test_a_foreign_checkpoint_fails_the_round_in_a_sentence(
+    trained: Loop, blob: Callable[[Loop], bytes], sentence: str
+) -> None:
+    sha256 = trained.blobs.put("weights", blob(trained))
+
+    def exchange(model: Any) -> None:
+        trained.set_row("model_version", model, sha256=sha256)
+
+    assert sentence in _fails_scoring(trained, exchange)
+
+
+def test_corrupted_weights_fail_the_round_in_a_sentence(trained: Loop) -> None:
+    def corrupt(model: Any) -> None:
+        sha256 = trained.client.model(model).sha256
+        path = trained.folder / "blobs" / "weights" / sha256[:2] / sha256
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+
+    assert "should have the hash" in _fails_scoring(trained, corrupt)
+
+
+def test_a_round_without_pool_labels_fails_in_a_sentence(trained: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained.label(1)
+    asked = start(trained)
+    monkeypatch.setattr(data.label_queries, "labels_up_to", lambda *_: [])
+    trained.drain()
+    assert "has no pool labels to train on" in str(trained.client.round(asked.id).error)
+
+
+def test_a_missing_observation_blob_fails_the_round_in_a_sentence(trained: Loop) -> None:
+    batch = trained.label(1)
+    asked = start(trained)
+    for path in (trained.folder / "blobs" / "trajectories").rglob("*/*"):
+        path.unlink()
+    trained.drain()
+    assert batch.round != asked.id
+    error = trained.client.round(asked.id).error
+    assert error is not None
+    assert MissingBlob.__name__ in error
+
+
+def _fails_scoring(loop: Loop, spoil: Callable[[Any], None]) -> str:
+    """The error of a second round whose world model is spoilt between training and scoring; the first is in use."""
+    before = loop.project.current_round
+    loop.label(5)
+    asked = start(loop)
+    while "world_model" not in loop.client.round(asked.id).models:
+        run_next(loop.worker)
+    spoil(loop.client.round(asked.id).models["world_model"])
+    loop.drain()
+    failed = loop.client.round(asked.id)
+    assert failed.status == "failed"
+    with loop.worker.database.read() as session:
+        scoring = session.query(ScoringRow).filter_by(round_id=asked.id).one()
+    assert scoring.status == "failed"
+    assert loop.project.current_round == before
+    assert loop.acquire(2).round == before
+    return str(failed.error)
+
+
+def _generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
