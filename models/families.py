@@ -131,7 +131,8 @@ class GridFamily:
         """One schedule a kind, the same for every strategy."""
         match kind:
             case "world_model":
-                return TrainingConfig(steps=600, batch_size=32, learning_rate=1e-2, weight_decay=0.5)
+                steps = min(3000, max(600, 3 * segments))  # more labels are worth more passes over them
+                return TrainingConfig(steps=steps, batch_size=32, learning_rate=1e-2, weight_decay=0.5)
             case "inverse_dynamics":
                 return TrainingConfig(steps=400, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
             case "dense_inverse_dynamics":

@@ -73,9 +73,7 @@ def add(
             raise SplitConflict(stored.id, member.split, split)
         member.provenance_sha256 = member.provenance_sha256 or provenance_sha256
         return _receipt(stored, member, "duplicate")
-    if session.get(TrajectoryRow, stored.id) is None:
-        session.add(_trajectory_row(stored, now))
-        session.flush()
+    queries.keep_content(session, _trajectory_row(stored, now))
     member = MembershipRow(
         project_id=project.id,
         trajectory_id=stored.id,

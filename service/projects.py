@@ -4,6 +4,7 @@ from datetime import datetime
 from uuid import UUID
 
 from sqlalchemy import select
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from api_schemas.environments import Environment, Spaces
@@ -33,7 +34,10 @@ def create(session: Session, request: ProjectCreate, now: datetime) -> ProjectRo
         created_at=now,
     )
     session.add(row)
-    session.flush()
+    try:
+        session.flush()
+    except IntegrityError as error:  # another took the name after the look above
+        raise NameTaken(request.name) from error
     events.record(session, row.id, "project.created", {"name": row.name}, now)
     return row
 

@@ -60,10 +60,14 @@ def run_round(job: RunningJob, payload: TrainRound) -> dict[str, object]:
 
 
 def run_subgoal_generator(job: RunningJob, payload: TrainSubgoalGenerator) -> dict[str, object]:
-    """Train the subgoal generator on the pool's observations, giving way to any other work."""
+    """Train the subgoal generator on the pool's observations, giving way to any other work.
+
+    The pool is the one that there was when the job was queued: a job that resumes goes on with the same segments.
+    """
     with job.worker.database.read() as session:
         project = projects.find(session, payload.project)
-        members = pool_queries.memberships(session, project.id, "pool")
+        queued_at = session.get_one(JobRow, job.lease.job_id).created_at
+        members = [m for m in pool_queries.memberships(session, project.id, "pool") if m.created_at <= queued_at]
         windows = data.windows_of(session, project, members, None)
     every = max(1, sum(len(window.starts) for window in windows) // SUBGOAL_SEGMENTS)
     thinned = [data.Windows(w.trajectory, w.blob_sha256, w.starts[::every]) for w in windows if w.starts]
@@ -81,8 +85,8 @@ def run_subgoal_generator(job: RunningJob, payload: TrainSubgoalGenerator) -> di
         if time.monotonic() - saved > CHECKPOINT_SECONDS:
             _save_state(job, state)
             saved = time.monotonic()
-        state = train_subgoal_generator(network, batch, state, SUBGOAL_SLICE)
         job.report(state.step / state.config.steps, f"subgoal generator, step {state.step} of {state.config.steps}")
+        state = train_subgoal_generator(network, batch, state, SUBGOAL_SLICE)
     blob = checkpoints.save(network)
     trained = _trained(job, "subgoal_generator", 0, blob, {"loss": sum(state.recent) / len(state.recent)})
     with job.transaction() as session:

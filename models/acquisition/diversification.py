@@ -11,7 +11,10 @@ from models.acquisition.base import CHUNK, Models
 from models.segments import SegmentBatch
 
 CANDIDATES_PER_PICK = 5
-"""Top candidates to diversify over for each pick. On MiniGrid 3 to 10 did about as well; 2 and 30 were worse."""
+"""The i-th pick is made among the 5 i highest scores. On MiniGrid 3 to 10 did about as well; 2 and 30 were worse."""
+
+FEWEST_CANDIDATES = 100
+"""The first picks have this many to choose from, so that small batches are diverse too."""
 
 
 def top(scores: Tensor, count: int) -> Tensor:
@@ -23,8 +26,10 @@ def diversify(scores: Tensor, features: Tensor | None, count: int, generator: to
     """An order (at most `count`,) over M candidates, every prefix of which is a good batch.
 
     Draws one candidate after another with probability proportional to sqrt(score) times the squared distance to the
-    nearest one drawn: scores (M,), at least 0, features (M, D). When only duplicates are left, they follow by score.
-    Without features it is the plain order by score. Raises ValueError for shapes that disagree or negative scores.
+    nearest one drawn: scores (M,), at least 0, features (M, D). A pick chooses among the highest scores only, the more
+    of them the later it comes, so that a short prefix is not drawn from a long tail. When only duplicates are left,
+    they follow by score. Without features it is the plain order by score. Raises ValueError for shapes that disagree
+    or negative scores.
     """
     if features is None:
         return top(scores, count)
@@ -33,16 +38,18 @@ def diversify(scores: Tensor, features: Tensor | None, count: int, generator: to
     if len(scores) and float(scores.min()) < 0:
         raise ValueError(f"scores must be at least 0 to weigh candidates, got {float(scores.min())}.")
     points, weights = features.double(), scores.double().sqrt()
-    order = _plus_plus(points, weights, min(count, len(scores)), generator)
+    ranking = top(scores, len(scores))
+    order = ranking[_plus_plus(points[ranking], weights[ranking], min(count, len(scores)), generator)]
     return torch.cat((order, _rest(scores, order)))[:count]
 
 
 def _plus_plus(points: Tensor, weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Places of the picks among candidates that come best first: points (M, D), weights (M,)."""
     nearest = torch.ones_like(weights)  # squared distance to the chosen; nothing chosen yet, so equal for all
     order: list[int] = []
     while len(order) < count:
-        mass = (weights * nearest).cumsum(0)
-        if not len(mass) or float(mass[-1]) <= 0.0:
+        mass = _mass(weights * nearest, max(FEWEST_CANDIDATES, CANDIDATES_PER_PICK * (len(order) + 1)))
+        if float(mass[-1]) <= 0.0:
             break
         draw = torch.rand((), generator=generator, device=generator.device, dtype=torch.float64).to(mass.device)
         chosen = min(int(torch.searchsorted(mass, draw * mass[-1], right=True)), len(mass) - 1)
@@ -51,6 +58,12 @@ def _plus_plus(points: Tensor, weights: Tensor, count: int, generator: torch.Gen
         nearest[chosen] = 0.0
         order.append(chosen)
     return torch.tensor(order, dtype=torch.int64, device=weights.device)
+
+
+def _mass(gain: Tensor, window: int) -> Tensor:
+    """Running sum of the best candidates' gain, or of everybody's where those hold only duplicates of the chosen."""
+    mass = gain[:window].cumsum(0)
+    return mass if float(mass[-1]) > 0.0 else gain.cumsum(0)
 
 
 def _rest(scores: Tensor, order: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from api_schemas.errors import PROBLEM_JSON, InvalidParam, Problem
-from service.errors import ServiceError
+from service.errors import BodyTooLarge, ServiceError
 from service.log import get_logger
 
 log = get_logger("api")
@@ -55,6 +55,8 @@ def _malformed(request: Request, error: Exception) -> JSONResponse:
 def _http_error(request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, HTTPException):
         raise error
+    if error.status_code == HTTPStatus.REQUEST_ENTITY_TOO_LARGE:  # a body that did not say its length beforehand
+        return answer(BodyTooLarge(str(error.detail)).problem(request.url.path))
     title = HTTPStatus(error.status_code).phrase
     problem = _problem(title.lower().replace(" ", "-"), error.status_code, title, str(error.detail), request)
     return answer(problem, dict(error.headers) if error.headers else None)

@@ -1,30 +1,41 @@
 """What a browser may do: only pages of this service's own host, and only this host's names."""
 
-from collections.abc import Awaitable, Callable
-from urllib.parse import urlsplit
+from http import HTTPStatus
 
-from fastapi import FastAPI, Request, Response
+from fastapi import FastAPI, HTTPException, Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api import problems
 from service.errors import BodyTooLarge, CrossOrigin, ServiceError
 from service.settings import Settings
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-Next = Callable[[Request], Awaitable[Response]]
 
 
 def install(app: FastAPI, settings: Settings) -> None:
     """Refuse foreign Host headers (DNS rebinding), cross-origin writes and bodies over the limit."""
+    app.add_middleware(Guard, settings=settings)
 
-    @app.middleware("http")
-    async def guard(request: Request, call_next: Next) -> Response:
+
+class Guard:
+    """The middleware; plain ASGI, because Starlette's base class copies every request through a task of its own."""
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self._app, self._settings = app, settings
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
         try:
-            _check_host(request, settings)
+            _check_host(request, self._settings)
             _check_origin(request)
-            _check_size(request, settings.max_body_bytes)
+            _check_size(request, self._settings.max_body_bytes)
         except ServiceError as error:
-            return problems.answer(error.problem(request.url.path))
-        return await call_next(request)
+            await problems.answer(error.problem(request.url.path))(scope, receive, send)
+        else:
+            await self._app(scope, _bounded(receive, self._settings.max_body_bytes), send)
 
 
 def _check_host(request: Request, settings: Settings) -> None:
@@ -37,7 +48,7 @@ def _check_origin(request: Request) -> None:
     origin = request.headers.get("origin")
     if request.method in SAFE_METHODS or origin is None:
         return
-    if urlsplit(origin).netloc != request.headers.get("host"):
+    if origin.partition("://")[2] != request.headers.get("host"):
         raise CrossOrigin(f"origin: {origin[:200]!r} may not write to this service")
 
 
@@ -45,6 +56,21 @@ def _check_size(request: Request, limit: int) -> None:
     length = request.headers.get("content-length", "0")
     if length.isdigit() and int(length) > limit:
         raise BodyTooLarge(f"content-length: {length} bytes, {limit} are allowed")
+
+
+def _bounded(receive: Receive, limit: int) -> Receive:
+    """A chunked body says no length: count it. FastAPI lets only its own exception through while it reads a body."""
+    total = 0
+
+    async def counted() -> Message:
+        nonlocal total
+        message = await receive()
+        total += len(message.get("body", b""))
+        if total > limit:
+            raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"body: {total} bytes, {limit} are allowed")
+        return message
+
+    return counted
 
 
 def _without_port(host: str) -> str:

@@ -115,7 +115,11 @@ def test_a_robots_actions_are_checked_number_by_number(served: Served) -> None:
     def changed(action: object) -> Json:
         return item | {"actions": [*good[:2], action, good[3]]}
 
-    for action, words in [([0.0] * 6, "must be 7 numbers"), (3, "must be 7 numbers"), ([0.0] * 6 + [1.01], "-1.0 to 1.0")]:
+    for action, words in [
+        ([0.0] * 6, "must be 7 numbers"),
+        (3, "must be 7 numbers"),
+        ([0.0] * 6 + [1.01], "-1.0 to 1.0"),
+    ]:
         refused(served.label(project, [changed(action)]), 422, "invalid-label", "actions[2]", words, action)
     refused(served.label(project, [item | {"actions": good[:3]}]), 422, "invalid-label", "length", "must be 4", 3)
     refused(served.label(project, [item | {"start": 2}]), 422, "invalid-label", "multiple of 4 up to 4", 2)

@@ -2,11 +2,14 @@
 
 import io
 import pickle
+import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pytest
+from fastapi.testclient import TestClient
 from numpy.typing import NDArray
 
 from service import pool
@@ -56,6 +59,19 @@ def test_projects_share_the_blob_and_not_the_access(served: Served) -> None:
         answer = served.client.get(path, params={"project": elsewhere})
         refused(answer, 404, "unknown-resource", elsewhere, trajectory)
     refused(served.client.get(f"/trajectories/{trajectory}", params={"project": UNKNOWN}), 404, "unknown-resource")
+
+
+def test_many_projects_may_store_the_same_trajectory_at_once(on_both: Served) -> None:
+    projects = [on_both.project() for _ in range(6)]
+    new = room(time.time_ns())  # the tests on PostgreSQL share a database
+
+    def send(project: str) -> int:
+        client = TestClient(on_both.app, base_url="http://127.0.0.1", raise_server_exceptions=False)
+        files = [("files", ("0.npz", npz(new)))]
+        return client.post("/trajectories", params={"project": project}, files=files).status_code
+
+    with ThreadPoolExecutor(6) as threads:
+        assert set(threads.map(send, projects)) == {201}
 
 
 def test_a_trajectory_says_what_it_is(served: Served) -> None:

@@ -1,4 +1,4 @@
-"""Small prepared projects: made once, copied for every test. Schedules are cut to a few steps; the code paths are real."""
+"""Small prepared projects, made once and copied for every test. Schedules are short, code paths are the real ones."""
 
 import shutil
 from collections.abc import Callable, Iterator

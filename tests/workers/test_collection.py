@@ -41,9 +41,7 @@ def test_repeated_episodes_do_not_count_twice(opened: OpenLoop, monkeypatch: pyt
     assert loop.project.counts.pool_segments == loop.project.counts.pool_trajectories == 8
 
 
-def test_a_simulator_with_nothing_new_to_show_ends_the_collection(
-    empty: Loop, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_simulator_with_nothing_new_to_show_ends_the_collection(empty: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
     reset, step = MiniGridSimulator.reset, MiniGridSimulator.step
     monkeypatch.setattr(MiniGridSimulator, "reset", lambda self, seed: reset(self, 0))
     monkeypatch.setattr(MiniGridSimulator, "step", lambda self, action: step(self, 0)._replace(truncated=True))
@@ -77,9 +75,7 @@ def test_every_action_gets_its_share_of_effective_labels(empty: Loop) -> None:
         seen = empty.client.trajectory_content(empty.project.id, label.trajectory, label.start, 1)
         states, _ = empty.client.provenance(empty.project.id, label.trajectory, label.start, 1)
         assert any(not np.array_equal(stream[0], stream[1]) for stream in seen.values())
-        explaining, _ = explain(
-            simulator, {k: v[0] for k, v in states.items()}, {k: v[1] for k, v in seen.items()}
-        )
+        explaining, _ = explain(simulator, {k: v[0] for k, v in states.items()}, {k: v[1] for k, v in seen.items()})
         assert label.actions[0] in explaining
 
 
@@ -147,7 +143,7 @@ def test_a_trajectory_of_the_other_split_fails_the_job_with_a_sentence(empty: Lo
 
 
 def test_an_unknown_behavior_is_refused_before_any_job(empty: Loop) -> None:
-    with pytest.raises(ServiceError, match="must be one of .*got dance"):
+    with pytest.raises(ServiceError, match=r"must be one of .*got dance"):
         empty.collect(10, behavior="dance")
     assert not list(empty.client.jobs(empty.project.id))
 

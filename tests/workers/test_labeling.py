@@ -30,7 +30,11 @@ def step_of(loop: Loop, label: Label) -> tuple[Arrays, Arrays, Arrays]:
     """State before, observation before and observation after a label's only step."""
     seen = loop.client.trajectory_content(loop.project.id, label.trajectory, label.start, 1)
     states, _ = loop.client.provenance(loop.project.id, label.trajectory, label.start, 1)
-    return ({k: v[0] for k, v in states.items()}, {k: v[0] for k, v in seen.items()}, {k: v[1] for k, v in seen.items()})
+    return (
+        {k: v[0] for k, v in states.items()},
+        {k: v[0] for k, v in seen.items()},
+        {k: v[1] for k, v in seen.items()},
+    )
 
 
 def test_exactly_the_actions_of_a_labels_set_reproduce_its_step(labeled: Loop) -> None:

@@ -14,6 +14,7 @@ from models.families import GRID
 from models.training import TrainingResult
 from service import reaper, registry
 from service.errors import MissingBlob
+from service.store.queries import labels as label_queries
 from service.store.tables import ModelVersionRow, ScoringRow
 from tests.workers.conftest import OpenLoop, new_project
 from tests.workers.in_process import Loop, segments_of
@@ -161,9 +162,7 @@ def test_a_worker_that_stops_gives_the_round_back_uncounted(labeled: Loop, monke
     assert len(calls) == 3  # the stopped stage again
 
 
-def test_what_a_silent_worker_writes_after_its_lease_is_refused(
-    labeled: Loop, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_silent_worker_writes_after_its_lease_is_refused(labeled: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = start(labeled)
 
     def another_finishes_it() -> None:
@@ -292,7 +291,7 @@ def test_corrupted_weights_fail_the_round_in_a_sentence(trained: Loop) -> None:
 def test_a_round_without_pool_labels_fails_in_a_sentence(trained: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
     trained.label(1)
     asked = start(trained)
-    monkeypatch.setattr(data.label_queries, "labels_up_to", lambda *_: [])
+    monkeypatch.setattr(label_queries, "labels_up_to", lambda *_: [])
     trained.drain()
     assert "has no pool labels to train on" in str(trained.client.round(asked.id).error)
 

@@ -8,7 +8,7 @@ import torch
 
 from api_schemas.jobs import Job
 from models.segments import SegmentBatch
-from models.training import TrainingState
+from models.training import TrainingState, train_subgoal_generator
 from tests.workers.conftest import STEPS, OpenLoop
 from tests.workers.in_process import Loop
 from workers import training
@@ -22,7 +22,7 @@ class Slices:
         self.batches: list[SegmentBatch] = []
         self.steps: list[int] = []
         self.after: dict[int, Any] = {}
-        self._real = training.train_subgoal_generator
+        self._real = train_subgoal_generator
         patch.setattr(training, "train_subgoal_generator", self._train)
 
     def _train(self, network: Any, batch: SegmentBatch, state: TrainingState, steps: int) -> TrainingState:
@@ -77,9 +77,7 @@ def test_it_sees_the_whole_pool_and_no_action(waiting: Loop, slices: Slices) -> 
         assert batch.size == waiting.project.counts.pool_segments == 600
 
 
-def test_its_weights_do_not_depend_on_the_labels(
-    opened: OpenLoop, labeled_folder: Path, trained_folder: Path
-) -> None:
+def test_its_weights_do_not_depend_on_the_labels(opened: OpenLoop, labeled_folder: Path, trained_folder: Path) -> None:
     loop = opened(labeled_folder)
     loop.label(30, "random", seed=5)
     loop.train()
@@ -142,9 +140,7 @@ def test_it_follows_the_growth_of_the_pool_and_not_the_labels(trained: Loop) -> 
     assert len(trained.jobs("train_subgoal_generator")) == 2
 
 
-def test_a_large_pool_is_thinned_out_evenly(
-    waiting: Loop, slices: Slices, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_large_pool_is_thinned_out_evenly(waiting: Loop, slices: Slices, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "SUBGOAL_SEGMENTS", 200)
     waiting.drain()
     starts = torch.tensor([segment.start for segment in slices.batches[0].segments])

@@ -6,6 +6,7 @@ from datetime import datetime
 from uuid import UUID
 
 from sqlalchemy import ColumnElement, and_, func, select
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from service.store.tables import ClaimRow, LabelRow, MembershipRow, TrajectoryRow
@@ -69,6 +70,15 @@ def newest_membership(session: Session, project_id: UUID, split: str) -> int:
         MembershipRow.project_id == project_id, MembershipRow.split == split
     )
     return session.scalar(statement) or 0
+
+
+def keep_content(session: Session, row: TrajectoryRow) -> None:
+    """Write the trajectory's row unless it is there; another project may be writing the same one at this moment."""
+    if session.get(TrajectoryRow, row.id) is not None:
+        return
+    insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
+    values = {column.key: getattr(row, column.key) for column in TrajectoryRow.__table__.columns}
+    session.execute(insert(TrajectoryRow).values(values).on_conflict_do_nothing())
 
 
 def contents(session: Session, trajectory_ids: Sequence[str]) -> dict[str, TrajectoryRow]:
