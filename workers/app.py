@@ -3,12 +3,18 @@
 celery -A workers.app worker -Q asim.train,asim.score -c 1
 """
 
+import argparse
+import os
+import signal
+import sys
 import threading
 from functools import cache
+from types import FrameType
 from typing import get_args
 from uuid import UUID
 
-from celery.signals import worker_process_init, worker_ready
+from billiard import active_children
+from celery.signals import worker_process_init, worker_ready, worker_shutting_down
 
 from api_schemas.jobs import RUN_JOB, Queue
 from service import jobs
@@ -22,6 +28,7 @@ from workers.job import Worker
 
 settings = Settings()
 app = celery_app(settings)
+STOP = signal.SIGUSR2  # from the parent to its children: SIGTERM and SIGUSR1 have a meaning of their own in Celery
 
 
 @app.task(name=RUN_JOB, acks_late=True, ignore_result=True)  # type: ignore[untyped-decorator]  # celery has no types
@@ -33,7 +40,18 @@ def run_job(job_id: str) -> None:
 @cache
 def worker() -> Worker:
     """This process's connections, opened at its first task."""
-    return open_worker(settings, utc_now, get_args(Queue))
+    return open_worker(settings, utc_now, served_queues(sys.argv))
+
+
+def served_queues(arguments: list[str]) -> tuple[str, ...]:
+    """The queues of `-Q`, all where there is none; a spawned child has its parent's command line.
+
+    A job gives way to work that waits in these queues, and not to what another worker has to do.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-Q", "--queues", default="")
+    asked = {name.split(".")[-1] for name in parser.parse_known_args(arguments)[0].queues.split(",")}
+    return tuple(name for name in get_args(Queue) if name in asked) or get_args(Queue)
 
 
 @worker_process_init.connect  # type: ignore[untyped-decorator]  # celery has no types
@@ -42,6 +60,19 @@ def _prepare_child(**_: object) -> None:
 
     configure_logs()
     limit_threads(settings)
+    signal.signal(STOP, _stop)
+
+
+@worker_shutting_down.connect  # type: ignore[untyped-decorator]  # celery has no types
+def _tell_children(**_: object) -> None:
+    """A warm shutdown waits for running tasks, minutes for some; told, they give their jobs back."""
+    worker().stopping.set()
+    for child in active_children():
+        os.kill(child.pid, STOP)
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    worker().stopping.set()
 
 
 @worker_ready.connect  # type: ignore[untyped-decorator]  # celery has no types

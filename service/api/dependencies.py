@@ -1,16 +1,17 @@
 """What handlers are given: sessions, stores, the clock, and who is asking."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from ipaddress import ip_address
 from typing import Annotated
 
 from fastapi import Depends, Query, Request, Security
+from fastapi.concurrency import run_in_threadpool
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from sqlalchemy.orm import Session
 
-from api_schemas.keys import Scope
+from api_schemas.keys import Key, Scope
 from service import keys
 from service.errors import NotAllowed, Unauthenticated
 from service.scorings import Limits, limits_of
@@ -36,7 +37,8 @@ class Services:
         return limits_of(self.settings)
 
 
-def services(request: Request) -> Services:
+# What only hands something on is `async`: a plain function would cost a trip through the thread pool each.
+async def services(request: Request) -> Services:
     """The process's services."""
     held: Services = request.app.state.services
     return held
@@ -55,7 +57,7 @@ def _read_session(held: ServicesDep) -> Iterator[Session]:
         yield session
 
 
-def _now(held: ServicesDep) -> datetime:
+async def _now(held: ServicesDep) -> datetime:
     return held.clock()
 
 
@@ -71,20 +73,24 @@ _bearer = HTTPBearer(auto_error=False, description="an API key; embedded mode ne
 Credentials = Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)]
 
 
-def requires(scope: Scope) -> Callable[[Request, Services, Credentials], None]:
+def requires(scope: Scope) -> Callable[[Request, Services, Credentials], Awaitable[None]]:
     """A dependency that lets in keys with this scope, and in embedded mode anybody on this machine without a key."""
 
-    def check(request: Request, held: ServicesDep, credentials: Credentials) -> None:
+    async def check(request: Request, held: ServicesDep, credentials: Credentials) -> None:
         if credentials is None:
             if held.settings.embedded and _is_loopback(request):
                 return
             raise Unauthenticated("authorization: send an API key as `Authorization: Bearer KEY`")
-        with held.database.read() as session:
-            key = keys.verify(session, credentials.credentials)
+        key = await run_in_threadpool(_verified, held, credentials.credentials)
         if scope not in key.scopes and "admin" not in key.scopes:
             raise NotAllowed(f"authorization: this needs the scope {scope!r}, the key has {', '.join(key.scopes)}")
 
     return check
+
+
+def _verified(held: Services, secret: str) -> Key:
+    with held.database.read() as session:
+        return keys.verify(session, secret)
 
 
 def _is_loopback(request: Request) -> bool:

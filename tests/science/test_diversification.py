@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from models.acquisition import Models, diversify, features, top
+from models.acquisition.diversification import CANDIDATES_PER_PICK, FEWEST_CANDIDATES
 from models.inverse_dynamics.base import DiscreteInverseDynamics
 from models.segments import SegmentBatch
 from models.world_models.grid import GridWorldModel
@@ -67,3 +68,12 @@ def test_features_tell_turning_from_moving(
 
 def test_top_keeps_ties_in_order() -> None:
     assert top(torch.tensor([1.0, 2.0, 2.0, 0.0]), 3).tolist() == [1, 2, 0]
+
+
+def test_a_short_prefix_comes_from_the_highest_scores_however_long_the_queue() -> None:
+    generator = torch.Generator().manual_seed(0)
+    scores, points = torch.linspace(1.0, 0.5, 2000), torch.randn(2000, 8, generator=generator)
+    order = diversify(scores, points, 2000, generator)
+    assert int(order[:20].max()) < FEWEST_CANDIDATES
+    assert int(order[:200].max()) < 200 * CANDIDATES_PER_PICK
+    assert sorted(order.tolist()) == list(range(2000))

@@ -23,8 +23,8 @@ OpenLoop = Callable[..., Loop]
 
 
 def short_schedule(family: GridFamily, kind: str, segments: int) -> TrainingConfig:
-    """The family's own schedule, but of STEPS steps."""
-    return replace(FULL_SCHEDULE(family, kind, segments), steps=STEPS)
+    """The family's own schedule, but of STEPS small steps."""
+    return replace(FULL_SCHEDULE(family, kind, segments), steps=STEPS, batch_size=16)
 
 
 def open_loop(folder: Path, **settings: object) -> Loop:
@@ -73,6 +73,17 @@ def labeled_folder(tmp_path_factory: pytest.TempPathFactory, _short_schedules: N
     loop.label(60, "random")
     loop.close()
     return folder
+
+
+@pytest.fixture(scope="package")
+def undisturbed(trained_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """By kind, the hash of the weights in `trained_folder`: what a run without any incident ends with."""
+    folder = tmp_path_factory.mktemp("read") / "data"
+    shutil.copytree(trained_folder, folder)
+    loop = open_loop(folder)
+    found: dict[str, str] = {model.kind: model.sha256 for model in loop.client.models(loop.project.id)}
+    loop.close()
+    return found
 
 
 @pytest.fixture(scope="package")

@@ -26,22 +26,29 @@ def labels_of(loop: Loop, wanted: list[tuple[str, int]]) -> list[Label]:
     return [stored[segment] for segment in wanted]
 
 
-def step_of(loop: Loop, label: Label) -> tuple[Arrays, Arrays, Arrays]:
-    """State before, observation before and observation after a label's only step."""
-    seen = loop.client.trajectory_content(loop.project.id, label.trajectory, label.start, 1)
-    states, _ = loop.client.provenance(loop.project.id, label.trajectory, label.start, 1)
-    return (
-        {k: v[0] for k, v in states.items()},
-        {k: v[0] for k, v in seen.items()},
-        {k: v[1] for k, v in seen.items()},
-    )
+class Steps:
+    """State before, observation before and observation after a label's only step; a trajectory is fetched once."""
+
+    def __init__(self, loop: Loop) -> None:
+        self._loop = loop
+        self._fetched: dict[str, tuple[Arrays, Arrays]] = {}
+
+    def of(self, label: Label) -> tuple[Arrays, Arrays, Arrays]:
+        if label.trajectory not in self._fetched:
+            project, client = self._loop.project.id, self._loop.client
+            states, _ = client.provenance(project, label.trajectory)
+            self._fetched[label.trajectory] = states, client.trajectory_content(project, label.trajectory)
+        states, seen = self._fetched[label.trajectory]
+        before = {name: array[label.start] for name, array in seen.items()}
+        after = {name: array[label.start + 1] for name, array in seen.items()}
+        return {name: array[label.start] for name, array in states.items()}, before, after
 
 
 def test_exactly_the_actions_of_a_labels_set_reproduce_its_step(labeled: Loop) -> None:
     batch = labeled.label(25, "random")
-    simulator = make_simulator("minigrid", ROOM.options)
+    simulator, steps = make_simulator("minigrid", ROOM.options), Steps(labeled)
     for label in labels_of(labeled, segments_of(batch)):
-        state, _, after = step_of(labeled, label)
+        state, _, after = steps.of(label)
         assert label.action_sets is not None
         explaining = label.action_sets[0]
         for action in range(len(ACTION_NAMES)):
@@ -56,10 +63,10 @@ def test_exactly_the_actions_of_a_labels_set_reproduce_its_step(labeled: Loop) -
 
 
 def test_a_step_without_effect_is_labeled_with_all_that_have_none(labeled: Loop) -> None:
-    batch = labeled.label(80, "random")
-    checked = 0
+    batch = labeled.label(60, "random")
+    checked, steps = 0, Steps(labeled)
     for label in labels_of(labeled, segments_of(batch)):
-        _, before, after = step_of(labeled, label)
+        _, before, after = steps.of(label)
         moved = any(not np.array_equal(before[name], after[name]) for name in before)
         if moved or tuple(before["carried"]) != NOTHING:
             continue

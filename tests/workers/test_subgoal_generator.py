@@ -84,7 +84,7 @@ def test_its_weights_do_not_depend_on_the_labels(opened: OpenLoop, labeled_folde
     assert weights(loop) == weights(opened(trained_folder))
 
 
-def test_it_gives_way_and_ends_with_the_same_bits(waiting: Loop, slices: Slices, trained: Loop) -> None:
+def test_it_gives_way_and_ends_with_the_same_bits(waiting: Loop, slices: Slices, undisturbed: dict[str, str]) -> None:
     slices.after = {2: lambda: waiting.ask_for_queue("vanilla_cycle")}
     run_next(waiting.worker)
     job = subgoal_job(waiting)
@@ -93,20 +93,20 @@ def test_it_gives_way_and_ends_with_the_same_bits(waiting: Loop, slices: Slices,
     waiting.drain()
     assert slices.steps == list(range(0, STEPS, training.SUBGOAL_SLICE))  # no step was done twice
     assert subgoal_job(waiting).attempts == 1
-    assert weights(waiting) == weights(trained)
+    assert weights(waiting) == undisturbed["subgoal_generator"]
 
 
-def test_a_stopping_worker_loses_no_slice(waiting: Loop, slices: Slices, trained: Loop) -> None:
+def test_a_stopping_worker_loses_no_slice(waiting: Loop, slices: Slices, undisturbed: dict[str, str]) -> None:
     slices.after = {2: waiting.worker.stopping.set}
     run_next(waiting.worker)
     assert (subgoal_job(waiting).state, subgoal_job(waiting).attempts) == ("queued", 0)
     waiting.drain(waiting.another_worker())
     assert slices.steps == list(range(0, STEPS, training.SUBGOAL_SLICE))
-    assert weights(waiting) == weights(trained)
+    assert weights(waiting) == undisturbed["subgoal_generator"]
 
 
 def test_after_a_crash_it_resumes_from_the_last_checkpoint(
-    waiting: Loop, slices: Slices, trained: Loop, monkeypatch: pytest.MonkeyPatch
+    waiting: Loop, slices: Slices, undisturbed: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def crash() -> None:
         raise OSError(5, "Input/output error")
@@ -117,17 +117,19 @@ def test_after_a_crash_it_resumes_from_the_last_checkpoint(
     waiting.clock.advance(10)
     waiting.drain()
     assert slices.steps == [0, 5, 10, 10, 15]
-    assert weights(waiting) == weights(trained)
+    assert weights(waiting) == undisturbed["subgoal_generator"]
 
 
-def test_a_pool_that_grows_meanwhile_changes_nothing(waiting: Loop, slices: Slices, trained: Loop) -> None:
+def test_a_pool_that_grows_meanwhile_changes_nothing(
+    waiting: Loop, slices: Slices, undisturbed: dict[str, str]
+) -> None:
     slices.after = {2: waiting.worker.stopping.set}
     run_next(waiting.worker)
     waiting.worker = waiting.another_worker()
     waiting.collect(300, seed=77, split="pool")
     assert subgoal_job(waiting).state == "done"
     assert {batch.size for batch in slices.batches} == {600}
-    assert weights(waiting) == weights(trained)
+    assert weights(waiting) == undisturbed["subgoal_generator"]
 
 
 def test_it_follows_the_growth_of_the_pool_and_not_the_labels(trained: Loop) -> None:

@@ -5,7 +5,7 @@ import binascii
 import json
 from typing import Any, TypeVar
 
-from sqlalchemy import Select, tuple_
+from sqlalchemy import BindParameter, Select, literal, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from service.errors import InvalidField
@@ -48,15 +48,14 @@ def _decode(cursor: str, length: int) -> list[Any]:
     return values
 
 
-def _parse(column: InstrumentedAttribute[Any], value: Any) -> Any:
+def _parse(column: InstrumentedAttribute[Any], value: Any) -> BindParameter[Any]:
+    """The value as its column writes it: inside a tuple nothing else tells the database's form of a time or an id."""
     kind = column.type.python_type
     try:
-        return (
-            value
-            if isinstance(value, kind)
-            else kind.fromisoformat(value)
-            if hasattr(kind, "fromisoformat")
-            else kind(value)
-        )
+        if not isinstance(value, kind):
+            value = kind.fromisoformat(value) if hasattr(kind, "fromisoformat") else kind(str(value))
     except (TypeError, ValueError) as error:
         raise InvalidField("cursor", value, "is not one of this listing") from error
+    if isinstance(value, int) and abs(value) >= 2**63:  # more than a database's integer holds
+        raise InvalidField("cursor", value, "is not one of this listing")
+    return literal(value, column.type)
