@@ -13,7 +13,7 @@ from types import FrameType
 from typing import get_args
 from uuid import UUID
 
-from billiard import active_children
+from billiard import active_children  # type: ignore[import-untyped]  # billiard has no types
 from celery.signals import worker_process_init, worker_ready, worker_shutting_down
 
 from api_schemas.jobs import RUN_JOB, Queue
