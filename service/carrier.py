@@ -47,9 +47,9 @@ def celery_app(settings: Settings) -> Celery:
 
 
 def relay(database: Database, app: Celery, prefix: str, now: datetime) -> int:
-    """Send every queued job that was not sent, or was sent long ago and never claimed; returns how many."""
+    """Send every job that may run and was not sent, or was sent long ago and never claimed; returns how many."""
     with database.write() as session:
-        rows = queries.unsent(session, now - RESEND_AFTER, BATCH)
+        rows = queries.unsent(session, now, now - RESEND_AFTER, BATCH)
         for row in rows:
             app.send_task(RUN_JOB, [str(row.id)], queue=f"{prefix}.{row.queue}")
             row.sent_at = now

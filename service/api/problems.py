@@ -5,7 +5,7 @@ from http import HTTPStatus
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DataError, OperationalError
 from starlette.exceptions import HTTPException
 
 from api_schemas.errors import PROBLEM_JSON, InvalidParam, Problem
@@ -20,6 +20,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(ServiceError, _service_error)
     app.add_exception_handler(RequestValidationError, _malformed)
     app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(DataError, _unstorable)
     app.add_exception_handler(OperationalError, _database_error)
     app.add_exception_handler(Exception, _unexpected)
 
@@ -42,9 +43,9 @@ def _malformed(request: Request, error: Exception) -> JSONResponse:
         raise error
     params = [
         InvalidParam(
-            name=".".join(str(part) for part in problem["loc"] if part != "body") or "body",
+            name=_printable(".".join(str(part) for part in problem["loc"] if part != "body")) or "body",
             reason=str(problem["msg"]).removeprefix("Value error, "),
-            value=str(problem.get("input"))[:200],
+            value=_printable(str(problem.get("input"))),
         )
         for problem in error.errors()
     ]
@@ -62,6 +63,12 @@ def _http_error(request: Request, error: Exception) -> JSONResponse:
     return answer(problem, dict(error.headers) if error.headers else None)
 
 
+def _unstorable(request: Request, error: Exception) -> JSONResponse:
+    reason = str(error.orig) if isinstance(error, DataError) else str(error)
+    detail = f"a value cannot be stored: {_printable(reason)}"
+    return answer(_problem("unstorable-value", 422, "A value cannot be stored", detail, request))
+
+
 def _database_error(request: Request, error: Exception) -> JSONResponse:
     log.error("database_error", path=request.url.path, error=str(error))
     detail = "the database did not answer in time; nothing was stored, try again"
@@ -74,6 +81,11 @@ def _unexpected(request: Request, error: Exception) -> JSONResponse:
     log.error("unexpected_error", path=request.url.path, exc_info=error)
     detail = "the service failed; nothing was stored, the log says why"
     return answer(_problem("internal-error", 500, "The service failed", detail, request))
+
+
+def _printable(text: str) -> str:
+    """At most 200 characters that UTF-8 can carry: JSON may hold halves of a surrogate pair."""
+    return text[:200].encode("utf-8", "backslashreplace").decode()
 
 
 def _problem(

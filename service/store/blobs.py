@@ -7,10 +7,13 @@ root of its own: service.store.provenance.
 import hashlib
 from pathlib import Path
 
-from obstore.exceptions import AlreadyExistsError
+from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, MemoryStore, S3Store, from_url
 
 from service.errors import CorruptBlob, MissingBlob
+from service.log import get_logger
+
+log = get_logger("store")
 
 
 class Blobs:
@@ -44,7 +47,13 @@ class Blobs:
 
     def reachable(self) -> bool:
         """True where the store answers a listing."""
-        next(iter(self._store.list(chunk_size=1)), None)
+        if isinstance(self._store, LocalStore) and not Path(str(self._store.prefix)).is_dir():
+            return False
+        try:
+            next(iter(self._store.list(chunk_size=1)), None)
+        except (BaseError, OSError) as error:
+            log.warning("blobs_unreachable", error=str(error))
+            return False
         return True
 
     def _mend(self, kind: str, sha256: str, data: bytes) -> None:

@@ -67,7 +67,7 @@ def _check_jobs(client: Client, project: UUID) -> None:
 def _check_models(client: Client, project: UUID) -> None:
     rounds = list(client.rounds(project))
     assert repeated(Counter(each.number for each in rounds)) == []
-    assert [each.status for each in rounds].count("current") == 1
+    assert [each.status for each in rounds].count("current") == min(1, len(rounds))
     assert all(each.status in ("current", "superseded") for each in rounds)
     for model in client.models(project):
         weights = client.weights(model.id)

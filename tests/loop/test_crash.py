@@ -97,7 +97,7 @@ class Scene:
 def scene(serve: Serve) -> Iterator[Scene]:
     serving = serve()
     with Client(serving.url, retries=0) as client:
-        labeler = PersistentLabeler(serving.url)
+        labeler = PersistentLabeler(serving.url, count=2, pause=0.7)
         yield Scene(serving, client, labeler)
         if labeler.is_alive():
             labeler.finish()

@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 import structlog
+from sqlalchemy import delete
 
 from service.settings import Settings
 from service.store.database import migrate
+from service.store.tables import Row
 from tests.servers import postgres_database, postgres_server, postgres_url, redis_server, redis_space
-from tests.service.kit import Served, serve
+from tests.service.kit import MAX_BODY_BYTES, START, Served, serve
 
 __all__ = ["postgres_server", "postgres_url", "redis_server", "redis_space"]
 Serve = Callable[..., Served]
@@ -57,10 +59,25 @@ def start(tmp_path: Path, migrated: Path) -> Iterator[Serve]:
         served.close()
 
 
+@pytest.fixture(scope="session")
+def _embedded(tmp_path_factory: pytest.TempPathFactory, migrated: Path) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("embedded")
+    shutil.copy(migrated, folder / "asim.db")
+    made = serve(Settings(data_folder=folder, max_body_bytes=MAX_BODY_BYTES))
+    yield made
+    made.close()
+
+
 @pytest.fixture
-def served(start: Serve) -> Served:
-    """A service in embedded mode."""
-    return start()
+def served(_embedded: Served) -> Iterator[Served]:
+    """An empty service in embedded mode. One for all tests, emptied after each: a new one prepares every query anew."""
+    _embedded.clock.now = START
+    yield _embedded
+    with _embedded.services.database.write() as session:
+        for table in reversed(Row.metadata.sorted_tables):
+            session.execute(delete(table))
+    for path in [path for path in _embedded.settings.data_folder.glob("*/*") if path.is_dir()]:
+        shutil.rmtree(path)
 
 
 @pytest.fixture(scope="session")
@@ -71,14 +88,15 @@ def _postgres_schema(postgres_server: str) -> Iterator[str]:
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def on_both(request: pytest.FixtureRequest, start: Serve) -> Served:
-    """The same test on both databases; on PostgreSQL the tests share one, each in projects of its own."""
-    if request.param == "sqlite":
-        return start()
-    return start(database_url=request.getfixturevalue("_postgres_schema"))
+def on_both(request: pytest.FixtureRequest) -> Served:
+    """The same test on both databases."""
+    served: Served = request.getfixturevalue("served" if request.param == "sqlite" else "on_postgres")
+    return served
 
 
-@pytest.fixture
-def on_postgres(start: Serve, _postgres_schema: str) -> Served:
-    """For what only a database with concurrent writers can get wrong."""
-    return start(database_url=_postgres_schema)
+@pytest.fixture(scope="session")
+def on_postgres(tmp_path_factory: pytest.TempPathFactory, _postgres_schema: str) -> Iterator[Served]:
+    """A service on PostgreSQL, for all tests: each keeps to projects of its own."""
+    made = serve(Settings(data_folder=tmp_path_factory.mktemp("postgres"), database_url=_postgres_schema))
+    yield made
+    made.close()

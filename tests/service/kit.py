@@ -3,12 +3,14 @@
 import io
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any
 from uuid import UUID, uuid4
 
 import numpy as np
+from anyio.from_thread import start_blocking_portal
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from httpx2 import Response
@@ -36,11 +38,15 @@ ROBOT: Json = {
 }
 
 
+MAX_BODY_BYTES = 4 * 2**20
+START = datetime(2026, 1, 1, tzinfo=UTC)
+
+
 class Clock:
     """Stands still but for a microsecond a reading, until it is told to advance."""
 
     def __init__(self) -> None:
-        self.now = datetime(2026, 1, 1, tzinfo=UTC)
+        self.now = START
         self._lock = threading.Lock()
 
     def __call__(self) -> datetime:
@@ -61,6 +67,7 @@ class Served:
     clock: Clock
     app: FastAPI
     client: TestClient
+    opened: ExitStack
     workers: dict[tuple[str, ...], Worker] = field(default_factory=dict)
 
     @property
@@ -133,6 +140,7 @@ class Served:
     def close(self) -> None:
         """Give back all connections."""
         self.client.close()
+        self.opened.close()
         self.services.database.close()
         for worker in self.workers.values():
             worker.database.close()
@@ -142,7 +150,9 @@ def serve(settings: Settings, clock: Clock | None = None) -> Served:
     """The service on these settings."""
     clock = clock or Clock()
     app = create_app(settings, clock)
-    return Served(settings, clock, app, TestClient(app, base_url="http://127.0.0.1"))
+    client, opened = TestClient(app, base_url="http://127.0.0.1"), ExitStack()
+    client.portal = opened.enter_context(start_blocking_portal())  # one event loop, not a new one a request
+    return Served(settings, clock, app, client, opened)
 
 
 def room(seed: int, transitions: int = 5, size: int = 6) -> Arrays:

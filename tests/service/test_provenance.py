@@ -29,7 +29,7 @@ def test_a_collection_brings_trajectories_and_their_states(served: Served) -> No
     metadata = json.loads(str(arrays.pop("__metadata__")))
     assert (metadata["simulator"], metadata["behavior"]) == ("minigrid", "random")
     assert {len(array) for array in arrays.values()} == {trajectory["transitions"] + 1}
-    query = {"project": project, "start": 2, "length": 3}
+    query: dict[str, str | int] = {"project": project, "start": 2, "length": 3}
     window = unpack(served.client.get(f"/trajectories/{trajectory['id']}/provenance", params=query).content)
     for name, array in arrays.items():
         assert np.array_equal(window[name], array[2:6])
@@ -44,8 +44,8 @@ def test_states_are_in_no_blob_that_training_can_open(served: Served) -> None:
     assert {path.name for path in (folder / "blobs").iterdir()} == {"trajectories"}
 
 
-def test_a_process_without_the_store_has_no_states_to_serve(served: Served, start: Serve) -> None:
-    project, trajectory = collected(served)
+def test_a_process_without_the_store_has_no_states_to_serve(start: Serve) -> None:
+    project, trajectory = collected(start())
     blind = start(provenance_url="")
     path = f"/trajectories/{trajectory['id']}/provenance"
     refused(blind.client.get(path, params={"project": project}), 404, "no-provenance", trajectory["id"])

@@ -148,8 +148,8 @@ def test_a_key_that_makes_no_sense_is_refused(served: Served, body: dict[str, ob
     refused(served.client.post("/keys", json=body), 422, "malformed-request")
 
 
-def test_scaled_out_nothing_is_open_without_a_key_but_health(served: Served, start: Serve) -> None:
-    headers = key(served, "admin")
+def test_scaled_out_nothing_is_open_without_a_key_but_health(start: Serve) -> None:
+    headers = key(start(), "admin")
     scaled = start(broker_url="memory://")
     paths = ["/projects", "/strategies", "/events", "/metrics", f"/jobs/{UNKNOWN}", f"/trajectories?project={UNKNOWN}"]
     for path in paths:

@@ -40,9 +40,10 @@ def silent(session: Session, now: datetime) -> Sequence[JobRow]:
     return session.scalars(statement.with_for_update(skip_locked=True)).all()
 
 
-def unsent(session: Session, stale: datetime, limit: int) -> Sequence[JobRow]:
-    """Queued jobs that no carrier was given, or was given before `stale`."""
-    statement = select(JobRow).where(JobRow.state == "queued", or_(JobRow.sent_at.is_(None), JobRow.sent_at <= stale))
+def unsent(session: Session, now: datetime, stale: datetime, limit: int) -> Sequence[JobRow]:
+    """Jobs that may run now and that no carrier was given, or was given before `stale`."""
+    due = or_(JobRow.sent_at.is_(None), JobRow.sent_at <= stale)
+    statement = select(JobRow).where(JobRow.state == "queued", _ready(now), due)
     return session.scalars(statement.order_by(JobRow.created_at).limit(limit)).all()
 
 
@@ -63,5 +64,9 @@ def forget_workers(session: Session, before: datetime) -> None:
 
 
 def _waiting(queues: Sequence[str], now: datetime) -> ColumnElement[bool]:
-    ready = or_(JobRow.not_before.is_(None), JobRow.not_before <= now)
-    return (JobRow.state == "queued") & JobRow.queue.in_(queues) & ready
+    return (JobRow.state == "queued") & JobRow.queue.in_(queues) & _ready(now)
+
+
+def _ready(now: datetime) -> ColumnElement[bool]:
+    """The pause before another attempt is over."""
+    return or_(JobRow.not_before.is_(None), JobRow.not_before <= now)
