@@ -9,8 +9,6 @@ from collections.abc import Callable
 from datetime import datetime, timedelta
 
 from celery import Celery
-from kombu.exceptions import OperationalError
-from sqlalchemy.exc import SQLAlchemyError
 
 from api_schemas.jobs import RUN_JOB
 from service import reaper
@@ -48,12 +46,13 @@ def celery_app(settings: Settings) -> Celery:
 
 def relay(database: Database, app: Celery, prefix: str, now: datetime) -> int:
     """Send every job that may run and was not sent, or was sent long ago and never claimed; returns how many."""
-    with database.write() as session:
-        rows = queries.unsent(session, now, now - RESEND_AFTER, BATCH)
-        for row in rows:
-            app.send_task(RUN_JOB, [str(row.id)], queue=f"{prefix}.{row.queue}")
-            row.sent_at = now
-    return len(rows)
+    with database.read() as session:
+        waiting = [(row.id, row.queue) for row in queries.unsent(session, now, now - RESEND_AFTER, BATCH)]
+    for job_id, queue in waiting:  # outside any transaction: a broker may take its time
+        app.send_task(RUN_JOB, [str(job_id)], queue=f"{prefix}.{queue}")
+        with database.write() as session:
+            queries.mark_sent(session, job_id, now)
+    return len(waiting)
 
 
 class Relay:
@@ -80,6 +79,6 @@ class Relay:
                 with self._database.write() as session:
                     reaper.reap(session, self._clock())
                 relay(self._database, app, self._settings.celery_prefix, self._clock())
-            except (SQLAlchemyError, OperationalError) as error:
-                log.warning("relay_failed", error=str(error))
+            except Exception as error:  # the thread's boundary: without it one bad moment would end all sending
+                log.exception("relay_failed", error=str(error))
                 self._stop.wait(1.0)

@@ -1,5 +1,6 @@
 """asim serve, asim worker, asim demo: the commands that start processes."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -56,4 +57,5 @@ def settings_of(data: Path | None) -> "Settings":
 
 
 def _tell(line: str) -> None:
-    typer.echo(line)
+    with suppress(BrokenPipeError):  # `asim serve | head`: nobody reads on, and the service goes on
+        typer.echo(line)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import ColumnElement, delete, func, or_, select
+from sqlalchemy import ColumnElement, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from service.store.tables import JobRow, WorkerRow
@@ -45,6 +45,11 @@ def unsent(session: Session, now: datetime, stale: datetime, limit: int) -> Sequ
     due = or_(JobRow.sent_at.is_(None), JobRow.sent_at <= stale)
     statement = select(JobRow).where(JobRow.state == "queued", _ready(now), due)
     return session.scalars(statement.order_by(JobRow.created_at).limit(limit)).all()
+
+
+def mark_sent(session: Session, job_id: UUID, now: datetime) -> None:
+    """Note that a carrier has the job, unless it was claimed in the meantime."""
+    session.execute(update(JobRow).where(JobRow.id == job_id, JobRow.state == "queued").values(sent_at=now))
 
 
 def counts_by_state(session: Session) -> Sequence[tuple[str, str, int]]:
