@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,8 +10,7 @@ from torch import Tensor
 Observations = dict[str, Tensor]
 
 
-@dataclass(frozen=True, order=True)
-class Segment:
+class Segment(NamedTuple):
     """A window of a trajectory: `start` is the index of its first observation."""
 
     trajectory: str

@@ -56,10 +56,10 @@ def served_queues(arguments: list[str]) -> tuple[str, ...]:
 
 @worker_process_init.connect  # type: ignore[untyped-decorator]  # celery has no types
 def _prepare_child(**_: object) -> None:
-    from workers.runner import limit_threads
+    from workers.runner import prepare_science
 
     configure_logs()
-    limit_threads(settings)
+    prepare_science(settings)
     signal.signal(STOP, _stop)
 
 

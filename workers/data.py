@@ -1,6 +1,7 @@
 """From rows and blobs to segment batches. Observations and labels only: nothing here can open a simulator state."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,7 @@ from service.store.queries import labels as label_queries
 from service.store.queries import pool as pool_queries
 from service.store.tables import LabelRow, MembershipRow, ProjectRow
 
-CHUNK_SEGMENTS = 4096  # segments decoded at a time: bounds memory whatever the size of the pool
+CHUNK_SEGMENTS = 2048  # segments decoded at a time: bounds memory whatever the size of the pool
 
 
 @dataclass(frozen=True)
@@ -70,17 +71,34 @@ def load(blobs: Blobs, windows: Sequence[Windows], length: int) -> SegmentBatch:
 
 
 def chunks(blobs: Blobs, windows: Sequence[Windows], length: int) -> Iterator[SegmentBatch]:
-    """The same segments in batches of about CHUNK_SEGMENTS, whole trajectories each."""
+    """The same segments in batches of about CHUNK_SEGMENTS, whole trajectories each, one read ahead of its use.
+
+    Reading waits for disk or network most of the time, so the next batch is read while this one is scored.
+    """
+    groups = _groups(windows)
+    with ThreadPoolExecutor(1, "read-ahead") as reader:
+        ahead = None
+        for group in groups:
+            ready, ahead = ahead, reader.submit(load, blobs, group, length)
+            if ready is not None:
+                yield ready.result()
+        if ahead is not None:
+            yield ahead.result()
+
+
+def _groups(windows: Sequence[Windows]) -> Iterator[list[Windows]]:
     group: list[Windows] = []
+    segments = 0
     for window in windows:
         if not window.starts:
             continue
         group.append(window)
-        if sum(len(member.starts) for member in group) >= CHUNK_SEGMENTS:
-            yield load(blobs, group, length)
-            group = []
+        segments += len(window.starts)
+        if segments >= CHUNK_SEGMENTS:
+            yield group
+            group, segments = [], 0
     if group:
-        yield load(blobs, group, length)
+        yield group
 
 
 def labeled_batch(

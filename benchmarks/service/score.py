@@ -2,9 +2,11 @@
 
 The job is what a worker does: claim, rows, blobs, decoding, cycle scores, storing, and the merge that selects the
 queue. The bare pass is the same networks on the same segments, tensors already in memory: the inverse dynamics infers,
-the world model encodes, predicts and decodes, and nothing is compared. Both alternate; ratios are of medians.
+the world model encodes, predicts and decodes, and nothing is compared. Torch has one thread in both; the job reads its
+next segments ahead in a second thread, as a worker does. Both alternate; ratios are of medians.
 """
 
+import gc
 import statistics
 import tempfile
 import time
@@ -30,21 +32,22 @@ from service.store.queries import rounds as round_queries
 from workers import data
 from workers.dispatch import open_worker, run_next
 from workers.job import Worker
-from workers.runner import limit_threads
+from workers.runner import prepare_science
 from workers.scoring import load_models
 
-TRANSITIONS, LABELS_PER_ACTION, REPEATS = 28_000, 30, 5
+TRANSITIONS, LABELS_PER_ACTION, REPEATS = 28_000, 30, 9
 
 
 def main() -> None:
     """Run and print."""
     with tempfile.TemporaryDirectory() as folder:
         settings = Settings(data_folder=Path(folder), torch_threads=1)
-        limit_threads(settings)
+        prepare_science(settings)
         migrate(settings.resolved_database_url())
         worker = open_worker(settings, utc_now, ("label", "train", "score"))
         project_id = _prepare(worker, utc_now())
         models, batch = _loaded(worker, project_id)
+        gc.freeze()  # the bare pass's tensors and names are no garbage either, and no worker holds them
         shard, merge, bare = [], [], []
         for _ in range(REPEATS):
             bare.append(_seconds(lambda: _forward(models, batch)))

@@ -267,9 +267,9 @@ def test_held_out_batches_are_uniform_over_held_out_segments(served: Served) -> 
     assert set(drawn) == {(member["id"], start) for start in range(8)}
     assert max(drawn.count(segment) for segment in drawn) < 18  # 7.5 expected, 2.4 standard deviation
     refused(served.ask(project, 9, purpose="held_out"), 409, "pool-exhausted", 9, 8, "held_out")
-    batch = served.acquire(project, 8, purpose="held_out")
-    assert len(set(segments(batch))) == 8
-    assert served.label(project, answers(batch), batch).status_code == 201
+    batches = [served.acquire(project, count, purpose="held_out") for count in (5, 3)]
+    assert len({segment for batch in batches for segment in segments(batch)}) == 8
+    assert {served.label(project, answers(batch), batch).status_code for batch in batches} == {201}
     counts, budget = served.show(project)["counts"], served.show(project)["budget"]
     assert (counts["held_out_labeled"], counts["labeled"], budget["spent"]) == (8, 0, 0)
     refused(served.ask(project, 1, purpose="held_out"), 409, "pool-exhausted", "0 are unlabeled")
