@@ -11,10 +11,20 @@ DType = Literal["uint8", "int32", "int64", "float32", "float64"]
 
 
 class Stream(Schema):
-    """One named array of an observation; `shape` has no time axis."""
+    """One named array of an observation; `shape` has no time axis.
+
+    high: the largest value allowed, one number for all or one for each place along the last axis.
+    """
 
     dtype: DType
     shape: tuple[int, ...]
+    high: int | tuple[int, ...] | None = None
+
+    @model_validator(mode="after")
+    def _high_fits_the_last_axis(self) -> "Stream":
+        if isinstance(self.high, tuple) and (not self.shape or len(self.high) != self.shape[-1]):
+            raise ValueError(f"high: {self.high} needs one number for each place of the last axis of {self.shape}")
+        return self
 
 
 class DiscreteActions(Schema):
@@ -61,14 +71,33 @@ class MiniGridOptions(Schema):
         return self
 
 
+GRID_HIGH = (10, 5, 4)  # the last object, colour and state that the grid family knows
+
+
+def takes_grid(spaces: Spaces) -> bool:
+    """Whether the grid family takes the spaces: a square grid and a hand in its code, discrete actions."""
+    grid, carried = spaces.observations.get("grid"), spaces.observations.get("carried")
+    if len(spaces.observations) != 2 or grid is None or carried is None:
+        return False
+    square = len(grid.shape) == 3 and grid.shape[0] == grid.shape[1] >= 3 and grid.shape[2] == 3
+    bytes_only = grid.dtype == carried.dtype == "uint8" and carried.shape == (3,)
+    return square and bytes_only and isinstance(spaces.actions, DiscreteActions)
+
+
+def bounded_grid(spaces: Spaces) -> Spaces:
+    """The same spaces with the grid family's largest values on every stream."""
+    streams = {name: stream.model_copy(update={"high": GRID_HIGH}) for name, stream in spaces.observations.items()}
+    return spaces.model_copy(update={"observations": streams})
+
+
 def minigrid_spaces(options: Mapping[str, object]) -> Spaces:
     """Spaces of the MiniGrid simulator. A contract test holds them equal to the simulator's own."""
     size = MiniGridOptions.model_validate(dict(options)).room_size
     names = ("left", "right", "forward", "pickup", "drop", "toggle", "swap")
     return Spaces(
         observations={
-            "grid": Stream(dtype="uint8", shape=(size, size, 3)),
-            "carried": Stream(dtype="uint8", shape=(3,)),
+            "grid": Stream(dtype="uint8", shape=(size, size, 3), high=GRID_HIGH),
+            "carried": Stream(dtype="uint8", shape=(3,), high=GRID_HIGH),
         },
         actions=DiscreteActions(n=7, names=names, groups={"movement": (0, 1, 2), "interaction": (3, 4, 5, 6)}),
     )

@@ -75,7 +75,12 @@ QUEUES: dict[str, Queue] = {
     "merge_scores": "score",
     "select_queue": "score",
 }
-PRIORITIES: dict[str, int] = {"train_subgoal_generator": -10}  # others 0; higher goes first
+PRIORITIES: dict[str, int] = {  # others 0; higher goes first
+    "score_shard": 10,  # a queue that somebody waits for comes before the next training
+    "merge_scores": 10,
+    "select_queue": 10,
+    "train_subgoal_generator": -10,
+}
 
 
 class Job(Schema):

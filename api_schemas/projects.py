@@ -6,7 +6,7 @@ from uuid import UUID
 from pydantic import Field, model_validator
 
 from api_schemas.base import Schema, Timestamp
-from api_schemas.environments import Environment
+from api_schemas.environments import Environment, Spaces, bounded_grid, takes_grid
 from api_schemas.strategies import DEFAULT_STRATEGY, StrategyName
 
 Family = Literal["grid"]
@@ -32,7 +32,7 @@ class ProjectCreate(Schema):
 
     name: str = Field(min_length=1, max_length=80, pattern=r"^[^\s/](?:[^/\n]*[^\s/])?$")
     environment: Environment
-    family: Family = "grid"
+    family: Family | None = Field(default=None, description="default: the one that takes the spaces, if any does")
     segment_length: int = Field(default=1, ge=1)
     stride: int | None = Field(default=None, ge=1, description="default: segment_length")
     held_out_fraction: float = Field(default=0.1, ge=0, lt=1)
@@ -44,6 +44,21 @@ class ProjectCreate(Schema):
         if self.stride is not None and self.stride < self.segment_length:
             raise ValueError(f"stride: {self.stride} is less than segment_length {self.segment_length}")
         return self
+
+    @model_validator(mode="after")
+    def _family_takes_the_spaces(self) -> "ProjectCreate":
+        if self.family is not None and self.resolved_family() != self.family:
+            raise ValueError(f"family: {self.family!r} does not take these spaces")
+        return self
+
+    def resolved_spaces(self) -> Spaces:
+        """The spaces, with the largest values that the family knows where it has a say."""
+        spaces = self.environment.resolved_spaces()
+        return bounded_grid(spaces) if self.resolved_family() == "grid" else spaces
+
+    def resolved_family(self) -> Family | None:
+        """The model family that takes the spaces; without one a project holds data and labels but trains nothing."""
+        return "grid" if takes_grid(self.environment.resolved_spaces()) else None
 
 
 class ProjectPatch(Schema):
@@ -84,7 +99,7 @@ class Project(Schema):
     id: UUID
     name: str
     environment: Environment
-    family: Family
+    family: Family | None
     segment_length: int
     stride: int
     held_out_fraction: float

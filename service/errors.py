@@ -176,6 +176,15 @@ class NothingToLearn(ServiceError):
         super().__init__(f"project {project} has no pool labels to train on yet")
 
 
+class NoModelFamily(ServiceError):
+    """No model family takes this project's spaces."""
+
+    status_code = 409
+
+    def __init__(self, project: UUID) -> None:
+        super().__init__(f"project {project}: no model family takes its spaces, so no round can train on its labels")
+
+
 class NoSimulator(ServiceError):
     """The project names no simulator to run."""
 

@@ -96,6 +96,11 @@ def heartbeat(session: Session, lease: Lease, now: datetime, seconds: float, pro
     row.message = message
 
 
+def made_progress(session: Session, lease: Lease) -> None:
+    """A stage is stored for good: what goes wrong from here on is counted anew. Raises JobLost."""
+    held(session, lease).attempts = 1
+
+
 def complete(session: Session, lease: Lease, result: dict[str, object], now: datetime) -> JobRow:
     """The job is done. Raises JobLost."""
     row = held(session, lease)

@@ -22,6 +22,7 @@ from api_schemas.labels import (
 from api_schemas.trajectories import SplitChoice
 from service import acquisitions, events, pool, projects, rounds
 from service.errors import (
+    BudgetExhausted,
     InvalidField,
     InvalidLabel,
     InvalidLeaseToken,
@@ -55,7 +56,7 @@ def accept(
     """Store all labels or none, in the caller's transaction, and ask for a round when enough have come.
 
     uploads: the request's labeled trajectories, stored. Raises UnknownResource, InvalidLabel, InvalidLeaseToken,
-    LeaseLost, SegmentLeased, LabelConflict, SplitConflict.
+    LeaseLost, SegmentLeased, LabelConflict, SplitConflict, BudgetExhausted.
     """
     project = projects.find(session, request.project, lock=True)
     acquisition = _acquisition(session, project, request)
@@ -69,6 +70,7 @@ def accept(
     if acquisition is not None:
         acquisitions.close_if_labeled(session, acquisition, now)
     created = sum(receipt.status == "created" for receipt in receipts)
+    _check_budget(project, created)
     if created:
         data: dict[str, object] = {"count": created, "watermark": project.label_watermark, "by": request.source.name}
         events.record(session, project.id, "labels.accepted", data, now)
@@ -149,6 +151,13 @@ def _acquisition(session: Session, project: ProjectRow, request: LabelsRequest) 
     if request.token != row.token:
         raise InvalidLeaseToken(row.id, request.token)
     return row
+
+
+def _check_budget(project: ProjectRow, created: int) -> None:
+    """Acquired labels were reserved; uploads without a lease must find room too."""
+    total = projects.policy_of(project).label_budget
+    if total is not None and project.pool_labels > total:
+        raise BudgetExhausted(created, total - (project.pool_labels - created), total)
 
 
 def _items(project: ProjectRow, upload: LabeledUpload) -> list[LabelItem]:

@@ -128,6 +128,9 @@ def _check_stream(array: NDArray[Any], stream: Stream, name: str) -> None:
         raise InvalidTrajectory(f"{name}: dtype", array.dtype, f"must be {stream.dtype}")
     if array.shape[1:] != stream.shape or array.ndim == 0:
         raise InvalidTrajectory(f"{name}: shape", array.shape, f"must be (T + 1, {', '.join(map(str, stream.shape))})")
+    if stream.high is not None and (array > np.asarray(stream.high)).any():
+        where = np.argwhere(array > np.asarray(stream.high))[0]
+        raise InvalidTrajectory(f"{name}{where.tolist()}", array[tuple(where)], f"must be at most {stream.high}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0]
         raise InvalidTrajectory(f"{name}{where.tolist()}", array[tuple(where)], "must be finite")

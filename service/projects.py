@@ -3,7 +3,6 @@
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -19,13 +18,13 @@ from service.store.tables import ProjectRow
 
 def create(session: Session, request: ProjectCreate, now: datetime) -> ProjectRow:
     """A new project. Raises NameTaken."""
-    if session.scalar(select(ProjectRow.id).where(ProjectRow.name == request.name)) is not None:
+    if pool_queries.project_named(session, request.name) is not None:
         raise NameTaken(request.name)
     row = ProjectRow(
         name=request.name,
         environment=request.environment.model_dump(mode="json"),
-        spaces=request.environment.resolved_spaces().model_dump(mode="json"),
-        family=request.family,
+        spaces=request.resolved_spaces().model_dump(mode="json"),
+        family=request.resolved_family(),
         segment_length=request.segment_length,
         stride=request.stride or request.segment_length,
         held_out_fraction=request.held_out_fraction,

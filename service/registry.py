@@ -29,7 +29,7 @@ class TrainedModel:
 def register(
     session: Session, project_id: UUID, round_id: UUID | None, model: TrainedModel, watermark: int, now: datetime
 ) -> ModelVersionRow:
-    """A new model version. `watermark`: the labels it saw; for a subgoal generator, the newest membership it saw."""
+    """A new model version. `watermark`: the labels it saw; for a subgoal generator, how many pool trajectories."""
     row = ModelVersionRow(
         project_id=project_id,
         round_id=round_id,

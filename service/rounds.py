@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 from api_schemas.jobs import TrainRound, TrainSubgoalGenerator
 from api_schemas.rounds import ModelError, ModelErrorCurve, ModelErrorPoint, Round, Stage
 from service import events, jobs, projects
-from service.errors import NothingToLearn, UnknownResource
+from service.errors import NoModelFamily, NothingToLearn, UnknownResource
 from service.store.queries import jobs as job_queries
 from service.store.queries import labels as label_queries
 from service.store.queries import pool as pool_queries
@@ -17,10 +17,20 @@ from service.store.tables import ModelVersionRow, ProjectRow, RoundRow
 
 
 def request(session: Session, project: ProjectRow, now: datetime, max_attempts: int = 5) -> RoundRow:
-    """A round on all labels that are there now, and its job. Raises NothingToLearn."""
+    """A round on all labels that are there now, and its job. Raises NothingToLearn, NoModelFamily.
+
+    Asked for twice on the same labels it is one round; one that still waits for a worker gives way to a newer one.
+    """
+    if project.family is None:
+        raise NoModelFamily(project.id)
     labels = label_queries.label_count(session, project.id, "pool", project.label_watermark)
     if labels == 0:
         raise NothingToLearn(project.id)
+    waiting = queries.queued_rounds(session, project.id)
+    for row in waiting:
+        if row.watermark == project.label_watermark:
+            return row
+        _supersede_queued(session, row, now)
     row = RoundRow(
         project_id=project.id,
         number=queries.last_number(session, project.id) + 1,
@@ -34,7 +44,7 @@ def request(session: Session, project: ProjectRow, now: datetime, max_attempts: 
     session.flush()
     payload = TrainRound(round=row.id, strategy=projects.policy_of(project).strategy)
     row.job_id = jobs.enqueue(session, project.id, payload, row.id, now, max_attempts).id
-    project.round_watermark = project.pool_labels
+    project.labels_at_round = project.pool_labels
     _request_subgoal_generator(session, project, now, max_attempts)
     events.record(session, project.id, "round.requested", {"round": str(row.id), "labels": labels}, now)
     return row
@@ -43,7 +53,7 @@ def request(session: Session, project: ProjectRow, now: datetime, max_attempts: 
 def due(project: ProjectRow) -> bool:
     """True where enough pool labels have come since the last round was requested."""
     every = projects.policy_of(project).round_labels
-    return every > 0 and project.pool_labels - project.round_watermark >= every
+    return project.family is not None and every > 0 and project.pool_labels - project.labels_at_round >= every
 
 
 def find(session: Session, round_id: UUID, *, lock: bool = False) -> RoundRow:
@@ -82,6 +92,7 @@ def begin_scoring(session: Session, round_id: UUID) -> None:
 
 def make_current(session: Session, round_id: UUID, now: datetime) -> None:
     """The round's queue is ready: its models and queue are in use from now on. An older round never replaces it."""
+    projects.find(session, find(session, round_id).project_id, lock=True)  # one round at a time becomes current
     row = find(session, round_id, lock=True)
     if row.status in ("current", "superseded", "failed"):
         return
@@ -91,6 +102,7 @@ def make_current(session: Session, round_id: UUID, now: datetime) -> None:
     else:
         if current is not None:
             current.status = "superseded"
+            session.flush()  # before the other: at no moment are there two
         row.status = "current"
     row.finished_at = now
     events.record(session, row.project_id, f"round.{row.status}", {"round": str(row.id), "number": row.number}, now)
@@ -102,6 +114,8 @@ def fail(session: Session, round_id: UUID, error: str, now: datetime) -> None:
     if row.status in ("current", "superseded"):
         return
     row.status, row.error, row.finished_at = "failed", error, now
+    project = projects.find(session, row.project_id, lock=True)
+    project.labels_at_round = 0  # its labels are due again: the next one that is accepted asks for a round
     events.record(session, row.project_id, "round.failed", {"round": str(row.id), "error": error}, now)
 
 
@@ -140,13 +154,19 @@ def describe(session: Session, row: RoundRow) -> Round:
     )
 
 
+def _supersede_queued(session: Session, row: RoundRow, now: datetime) -> None:
+    """The round's job finds it superseded and returns at once."""
+    row.status, row.finished_at = "superseded", now
+    events.record(session, row.project_id, "round.superseded", {"round": str(row.id), "number": row.number}, now)
+
+
 def _request_subgoal_generator(session: Session, project: ProjectRow, now: datetime, max_attempts: int) -> None:
     """The generator learns from action-free data only, so it follows the pool's growth and not the labels."""
     newest = queries.newest_model(session, project.id, "subgoal_generator")
-    members = pool_queries.newest_membership(session, project.id, "pool")
+    members = pool_queries.split_count(session, project.id, "pool", now).trajectories
     if newest is not None and members < 2 * newest.watermark:
         return
-    if job_queries.unfinished(session, project.id) is None:
+    if job_queries.unfinished(session, project.id, "train_subgoal_generator") is None:
         payload = TrainSubgoalGenerator(project=project.id)
         jobs.enqueue(session, project.id, payload, project.id, now, max_attempts)
 

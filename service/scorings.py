@@ -48,17 +48,20 @@ def usable(session: Session, project: ProjectRow, requested: str, now: datetime,
     """A scoring whose queue is ready, or the job that will make one.
 
     Before the first round a strategy that needs models falls back on COLD_START_STRATEGY. A model's scores hold for
-    the pool as it was scored; a model-free scoring is made anew when the pool has grown.
+    the pool as it was scored; a model-free scoring is made anew when the pool has grown, while the old queue serves on.
     """
     current = round_queries.current_round(session, project.id)
     strategy = requested if current or not NEEDS[requested] else COLD_START_STRATEGY
     round_row = current if NEEDS[strategy] else None
-    scoring = queries.newest_scoring(session, project.id, strategy, round_row.id if round_row else None)
-    if scoring is None or (scoring.status == "ready" and round_row is None and _outgrown(session, scoring)):
+    newest = queries.newest_scoring(session, project.id, strategy, round_row.id if round_row else None)
+    if newest is None:
         return _request(session, project, strategy, round_row, now, limits)
-    if scoring.status == "ready":
-        return scoring
-    return _waiting(session, scoring, now, limits)
+    if newest.status == "ready" and round_row is None and _outgrown(session, newest):
+        start(session, project, strategy, None, now, limits)  # for later; the queue that is there serves meanwhile
+    if newest.status == "ready":
+        return newest
+    ready = queries.newest_scoring(session, project.id, strategy, newest.round_id, "ready")
+    return ready or _waiting(session, newest, now, limits)
 
 
 def start(
@@ -97,6 +100,9 @@ def refill(
     waiting = job_queries.unfinished(session, scoring.id)
     if waiting is not None:
         return waiting
+    newest = queries.newest_scoring(session, project.id, scoring.strategy, scoring.round_id)
+    if newest is not None and newest.status == "scoring":
+        return _waiting(session, newest, now, limits)
     if _outgrown(session, scoring):
         round_row = session.get(RoundRow, scoring.round_id) if scoring.round_id else None
         return _waiting(session, start(session, project, scoring.strategy, round_row, now, limits), now, limits)

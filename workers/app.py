@@ -15,20 +15,41 @@ from uuid import UUID
 
 from billiard import active_children  # type: ignore[import-untyped]  # billiard has no types
 from celery.signals import worker_process_init, worker_ready, worker_shutting_down
+from sqlalchemy.exc import SQLAlchemyError
 
 from api_schemas.jobs import RUN_JOB, Queue
 from service import jobs
 from service.carrier import celery_app
 from service.clock import utc_now
-from service.log import configure_logs
+from service.log import configure_logs, get_logger
 from service.settings import Settings
 from workers.dispatch import open_worker
 from workers.dispatch import run_job as run_job_here
 from workers.job import Worker
 
-settings = Settings()
-app = celery_app(settings)
+log = get_logger("worker")
 STOP = signal.SIGUSR2  # from the parent to its children: SIGTERM and SIGUSR1 have a meaning of their own in Celery
+
+
+def served_queues(arguments: list[str]) -> tuple[str, ...]:
+    """The queues of `-Q`, all where there is none; a spawned child has its parent's command line.
+
+    A job gives way to work that waits in these queues, and not to what another worker has to do.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-Q", "--queues", default="")
+    asked = {name.split(".")[-1] for name in parser.parse_known_args(arguments)[0].queues.split(",")}
+    return tuple(name for name in get_args(Queue) if name in asked) or get_args(Queue)
+
+
+def settings_for(queues: tuple[str, ...]) -> Settings:
+    """The environment's settings; simulator states are in reach of a worker that serves `label` only."""
+    given = Settings()
+    return given if "label" in queues else given.model_copy(update={"provenance_url": ""})
+
+
+settings = settings_for(served_queues(sys.argv))
+app = celery_app(settings)
 
 
 @app.task(name=RUN_JOB, acks_late=True, ignore_result=True)  # type: ignore[untyped-decorator]  # celery has no types
@@ -41,17 +62,6 @@ def run_job(job_id: str) -> None:
 def worker() -> Worker:
     """This process's connections, opened at its first task."""
     return open_worker(settings, utc_now, served_queues(sys.argv))
-
-
-def served_queues(arguments: list[str]) -> tuple[str, ...]:
-    """The queues of `-Q`, all where there is none; a spawned child has its parent's command line.
-
-    A job gives way to work that waits in these queues, and not to what another worker has to do.
-    """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("-Q", "--queues", default="")
-    asked = {name.split(".")[-1] for name in parser.parse_known_args(arguments)[0].queues.split(",")}
-    return tuple(name for name in get_args(Queue) if name in asked) or get_args(Queue)
 
 
 @worker_process_init.connect  # type: ignore[untyped-decorator]  # celery has no types
@@ -86,6 +96,9 @@ def _beat() -> None:
 
     parent = worker()
     while not parent.stopping.is_set():
-        with parent.database.write() as session:
-            jobs.worker_alive(session, parent.owner, parent.queues, parent.clock())
+        try:
+            with parent.database.write() as session:
+                jobs.worker_alive(session, parent.owner, parent.queues, parent.clock())
+        except SQLAlchemyError as error:  # the next beat tries again
+            log.warning("database_unreachable", error=str(error))
         parent.stopping.wait(ALIVE_SECONDS)

@@ -5,6 +5,7 @@ The actions are known only while the behavior runs. They are not stored, except 
 
 import json
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +20,9 @@ from service.errors import NoProvenance
 from service.labels import LabeledUpload
 from service.store import codec
 from service.store.provenance import ProvenanceBlobs
+from service.store.queries import pool as pool_queries
 from service.store.tables import ProjectRow
+from workers.explanation import explain
 from workers.job import RunningJob
 from workers.simulators.base import Behavior, Simulator
 from workers.simulators.catalog import make_behavior, make_simulator
@@ -52,31 +55,56 @@ def run_collection(job: RunningJob, asked: CollectionCreate, provenance: Provena
     environment = projects.environment_of(project)
     simulator = make_simulator(environment.simulator or "", environment.options)
     behavior = make_behavior(asked.behavior, simulator)
-    quota = _Quota(project, asked)
-    rng = np.random.default_rng(asked.seed)
-    done, batch, seen, repeats = 0, [], set[str](), 0
-    while done < asked.transitions and not quota.met and repeats < REPEATS:
-        job.report(done / asked.transitions, f"collected {done} of {asked.transitions} transitions")
-        episode = _episode(simulator, behavior, rng, asked.transitions - done)
-        identity = codec.content_id(episode.observations)
-        repeats = repeats + 1 if identity in seen else 0
-        if repeats:
-            continue
-        seen.add(identity)
+    quota = _Quota(project, asked, simulator)
+    collected, done, batch = 0, 0, []
+    for episode in _new_episodes(job, project, asked, simulator, behavior):
         batch.append((episode, quota.take(episode)))
-        done += episode.transitions
+        collected, done = collected + 1, done + episode.transitions
+        job.report(min(1.0, done / asked.transitions), f"collected {done} of {asked.transitions} transitions")
         if len(batch) == BATCH:
             _store(job, project, asked, batch, provenance)
             batch = []
+        if quota.met:
+            break
     _store(job, project, asked, batch, provenance)
     simulator.close()
-    return {"trajectories": len(seen), "transitions": done, "labels": dict(quota.taken), "short_of": quota.missing()}
+    return {"trajectories": collected, "transitions": done, "labels": dict(quota.taken), "short_of": quota.missing()}
+
+
+def _new_episodes(
+    job: RunningJob, project: ProjectRow, asked: CollectionCreate, simulator: Simulator, behavior: Behavior
+) -> Iterator[Episode]:
+    """Episodes of `asked.transitions` transitions in all; none twice, and none that the other split holds already."""
+    rng = np.random.default_rng(asked.seed)
+    seen: set[str] = set()
+    left, repeats = asked.transitions, 0
+    while left > 0 and repeats < REPEATS:
+        episode = _episode(simulator, behavior, rng, left)
+        identity = codec.content_id(episode.observations)
+        if identity in seen or _in_other_split(job, project, asked, identity):
+            repeats += 1
+            job.report(1 - left / asked.transitions, f"{repeats} episodes in a row were known before")
+            continue
+        seen.add(identity)
+        left, repeats = left - episode.transitions, 0
+        yield episode
+
+
+def _in_other_split(job: RunningJob, project: ProjectRow, asked: CollectionCreate, identity: str) -> bool:
+    with job.worker.database.read() as session:
+        member = pool_queries.membership(session, project.id, identity)
+    return member is not None and asked.split not in ("auto", member.split)
 
 
 class _Quota:
-    """How many effective transitions of each action are still to be labeled."""
+    """How many effective transitions of each action are still to be labeled.
 
-    def __init__(self, project: ProjectRow, asked: CollectionCreate) -> None:
+    A transition is effective when its action alone explains it: what happens by itself, like a flickering tile, has
+    every idle action as an explanation.
+    """
+
+    def __init__(self, project: ProjectRow, asked: CollectionCreate, simulator: Simulator) -> None:
+        self._simulator = simulator
         self.per_action = asked.labels.per_action if asked.labels else 0
         space = projects.spaces_of(project).actions
         self.names = space.names if isinstance(space, DiscreteActions) else ()
@@ -98,10 +126,15 @@ class _Quota:
         starts = []
         for start, action in enumerate(episode.actions):
             name = self._name(action)
-            if self.taken[name] < self.per_action and _effective(episode, start):
+            if self.taken[name] < self.per_action and self._effective(episode, start):
                 self.taken[name] += 1
                 starts.append(start)
         return starts
+
+    def _effective(self, episode: Episode, start: int) -> bool:
+        state = {name: array[start] for name, array in episode.states.items()}
+        observed = {name: stream[start + 1] for name, stream in episode.observations.items()}
+        return explain(self._simulator, state, observed)[0] == [episode.actions[start]]
 
     def _name(self, action: int) -> str:
         return self.names[action] if self.names else str(action)
@@ -127,10 +160,6 @@ def _episode(simulator: Simulator, behavior: Behavior, rng: np.random.Generator,
 def _stacked(steps: list[dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
     """T + 1 dicts of arrays to one dict of arrays (T + 1, ...)."""
     return {name: np.stack([step[name] for step in steps]) for name in steps[0]}
-
-
-def _effective(episode: Episode, start: int) -> bool:
-    return any(not np.array_equal(stream[start], stream[start + 1]) for stream in episode.observations.values())
 
 
 def _store(

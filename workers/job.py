@@ -8,7 +8,7 @@ from datetime import datetime
 from types import TracebackType
 from typing import Self
 
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from service import jobs
@@ -81,7 +81,7 @@ class RunningJob:
                 jobs.heartbeat(session, self.lease, self.now(), seconds, self._progress, self._message)
         except JobLost:
             self._lost.set()
-        except OperationalError as error:  # the next beat tries again; the lease outlasts a few of them
+        except SQLAlchemyError as error:  # the next beat tries again; the lease outlasts a few of them
             log.warning("heartbeat_failed", job=str(self.lease.job_id), error=str(error))
 
 

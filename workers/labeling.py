@@ -4,16 +4,18 @@ It restores the state in which a segment was observed and steps the simulator to
 observed next. No stored action is read: none is stored.
 """
 
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from api_schemas.acquisitions import Acquisition, AcquisitionItem
 from api_schemas.labels import LabelItem, LabelsAccepted, LabelSource, LabelsRequest
 from asim.client import Client
+from asim.errors import ServiceError
+from workers.explanation import explain
 from workers.simulators.base import Observation, Simulator, State
 from workers.simulators.catalog import make_simulator
 
@@ -34,39 +36,38 @@ class UnexplainedStep(ValueError):
 def run_labeling(
     client: Client, acquisition: Acquisition, generator: np.random.Generator, progress: Progress | None = None
 ) -> LabelsAccepted:
-    """Label all items of an acquisition and post them under its token. Raises UnexplainedStep and the client's errors.
+    """Label the items of an acquisition and post them under its token.
 
     generator: where several actions explain a step, draws the one that the label names beside the whole set.
+    Where an item cannot be labeled, the others are posted all the same and its segment is given back before the error
+    is raised. Raises UnexplainedStep and the client's errors.
     """
     project = client.project(acquisition.project)
     environment = project.environment
     if environment.simulator is None:
         raise ValueError(f"project {project.id} names no simulator; its labels must come from elsewhere")
+    if not acquisition.items:
+        raise ValueError(f"acquisition {acquisition.id} holds no items")
     simulator = make_simulator(environment.simulator, environment.options)
-    accepted: LabelsAccepted | None = None
     labels: list[LabelItem] = []
+    refused: list[UnexplainedStep | ServiceError] = []
     for done, item in enumerate(acquisition.items, 1):
-        labels.append(_label(client, acquisition, simulator, item, generator))
+        try:
+            labels.append(_label(client, acquisition, simulator, item, generator))
+        except (UnexplainedStep, ServiceError) as error:
+            refused.append(error)
         if progress is not None:
             progress(done, len(acquisition.items))
-        if len(labels) == BATCH or done == len(acquisition.items):
-            accepted = _joined(accepted, client.label(_request(acquisition, simulator, labels)))
-            labels = []
+    accepted = [
+        client.label(_request(acquisition, simulator, labels[first : first + BATCH]))
+        for first in range(0, len(labels), BATCH)
+    ]
     simulator.close()
-    if accepted is None:
-        raise ValueError(f"acquisition {acquisition.id} holds no items")
-    return accepted
-
-
-def explain(simulator: Simulator, state: State, observed: Observation) -> tuple[list[int], float]:
-    """All discrete actions that lead from `state` to `observed`, and the residual of the best of them.
-
-    The list is empty where even the best one misses; residual is the largest difference in any stream.
-    """
-    if not isinstance(simulator.action_space, gym.spaces.Discrete):
-        raise ValueError(f"action space {simulator.action_space} cannot be tried action by action")
-    residuals = [_residual(simulator, state, action, observed) for action in range(int(simulator.action_space.n))]
-    return [action for action, residual in enumerate(residuals) if residual == 0.0], min(residuals)
+    if refused:
+        if acquisition.token is not None:
+            client.release(acquisition.id, acquisition.token)
+        raise refused[0]
+    return functools.reduce(_joined, accepted)
 
 
 def _label(
@@ -99,12 +100,6 @@ def _steps(
         yield {name: array[step] for name, array in states.items()}, {n: a[step + 1] for n, a in content.items()}
 
 
-def _residual(simulator: Simulator, state: State, action: int, observed: Observation) -> float:
-    simulator.restore(state)
-    reached = simulator.step(action).observation
-    return max(float(np.abs(reached[name].astype(np.float64) - observed[name]).max()) for name in observed)
-
-
 def _request(acquisition: Acquisition, simulator: Simulator, labels: list[LabelItem]) -> LabelsRequest:
     return LabelsRequest(
         project=acquisition.project,
@@ -115,9 +110,7 @@ def _request(acquisition: Acquisition, simulator: Simulator, labels: list[LabelI
     )
 
 
-def _joined(before: LabelsAccepted | None, after: LabelsAccepted) -> LabelsAccepted:
-    if before is None:
-        return after
+def _joined(before: LabelsAccepted, after: LabelsAccepted) -> LabelsAccepted:
     return LabelsAccepted(
         receipts=[*before.receipts, *after.receipts],
         created=before.created + after.created,

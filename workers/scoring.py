@@ -44,6 +44,7 @@ def run_shard(job: RunningJob, payload: ScoreShard) -> dict[str, object]:
         project = projects.find(session, scoring.project_id)
         shard = session.get_one(ShardRow, (scoring.id, payload.shard))
         members = pool_queries.memberships(session, project.id, "pool", shard.first, shard.last)
+        members = [member for member in members if member.segments]
         windows = data.windows_of(session, project, members, None) if scorings.NEEDS[scoring.strategy] else []
         generator = _generator(session, project, scoring, f"shard {payload.shard}")
     if shard.blob_sha256 is not None:
@@ -127,10 +128,16 @@ def _order(
         models = load_models(session, job.worker.blobs, project, scoring.round_id)
         windows = _candidate_windows(session, project, pool, candidates, members)
         generator = _generator(session, project, scoring, f"selection {scoring.selections}")
-    described = features(models, data.load_in_order(job.worker.blobs, windows, project.segment_length))
+    batch = data.load_in_order(job.worker.blobs, windows, project.segment_length)
+    described = features(_needed(models, scoring.strategy), batch)
     scores = torch.from_numpy(pool.scores[candidates])
     order: NDArray[np.int64] = diversify(scores, described, len(candidates), generator).numpy()
     return order
+
+
+def _needed(models: Models, strategy: str) -> Models:
+    """Only the networks that the strategy reads: an arm is not diversified through another arm's networks."""
+    return Models(**{name: getattr(models, name) for name in STRATEGIES[strategy].needs})
 
 
 def _candidate_windows(
@@ -181,5 +188,6 @@ def _unpack(blobs: Blobs, shas: Sequence[str]) -> PoolScores:
 def _generator(session: Session, project: ProjectRow, scoring: ScoringRow, what: str) -> torch.Generator:
     """Projects of equal seed and pool draw alike, whatever their ids."""
     number = rounds.find(session, scoring.round_id).number if scoring.round_id else 0
-    text = f"{project.seed}/{scoring.strategy}/{number}/{what}"
+    size = len(pool_queries.memberships(session, project.id, "pool", last=scoring.memberships))
+    text = f"{project.seed}/{scoring.strategy}/{number}/{size}/{what}"
     return torch.Generator().manual_seed(zlib.crc32(text.encode()))

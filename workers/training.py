@@ -11,8 +11,8 @@ from models import checkpoints
 from models.families import Family, family_named
 from models.segments import SegmentBatch
 from models.training import TrainingState, begin, train, train_subgoal_generator
-from service import projects, registry, rounds, scorings
-from service.errors import NothingToLearn
+from service import jobs, projects, registry, rounds, scorings
+from service.errors import NoModelFamily, NothingToLearn
 from service.registry import TrainedModel
 from service.store.queries import acquisitions as scoring_queries
 from service.store.queries import pool as pool_queries
@@ -42,12 +42,14 @@ class Plan:
     @property
     def family(self) -> Family:
         """The project's model family."""
-        return family_named(self.project.family)
+        return _family(self.project)
 
 
 def run_round(job: RunningJob, payload: TrainRound) -> dict[str, object]:
     """Bring a round to where its scoring begins. May run twice, and after a crash at any line."""
     plan = _plan(job, payload)
+    if plan.round.status in ("superseded", "failed"):
+        return {"round": str(plan.round.id), "status": plan.round.status}
     with job.transaction() as session:
         rounds.begin_training(session, plan.round.id)
     labeled = _labels(job, plan, "pool")
@@ -67,12 +69,15 @@ def run_subgoal_generator(job: RunningJob, payload: TrainSubgoalGenerator) -> di
     with job.worker.database.read() as session:
         project = projects.find(session, payload.project)
         queued_at = session.get_one(JobRow, job.lease.job_id).created_at
+        trained = round_queries.newest_model(session, project.id, "subgoal_generator")
+        if trained is not None and trained.created_at > queued_at:  # an earlier attempt ended between the two
+            return {"model": str(trained.id)}
         members = [m for m in pool_queries.memberships(session, project.id, "pool") if m.created_at <= queued_at]
         windows = data.windows_of(session, project, members, None)
     every = max(1, sum(len(window.starts) for window in windows) // SUBGOAL_SEGMENTS)
     thinned = [data.Windows(w.trajectory, w.blob_sha256, w.starts[::every]) for w in windows if w.starts]
     batch = data.load(job.worker.blobs, thinned, project.segment_length)
-    family = family_named(project.family)
+    family = _family(project)
     generator = _generator(project, 0, "subgoal_generator", 0)
     network = family.build_subgoal_generator(data.model_spaces(projects.spaces_of(project)), None, generator)
     config = family.training_config("subgoal_generator", batch.size)
@@ -88,9 +93,9 @@ def run_subgoal_generator(job: RunningJob, payload: TrainSubgoalGenerator) -> di
         job.report(state.step / state.config.steps, f"subgoal generator, step {state.step} of {state.config.steps}")
         state = train_subgoal_generator(network, batch, state, SUBGOAL_SLICE)
     blob = checkpoints.save(network)
-    trained = _trained(job, "subgoal_generator", 0, blob, {"loss": sum(state.recent) / len(state.recent)})
+    model = _trained(job, "subgoal_generator", 0, blob, {"loss": sum(state.recent) / len(state.recent)})
     with job.transaction() as session:
-        row = registry.register(session, project.id, None, trained, members[-1].id, job.now())
+        row = registry.register(session, project.id, None, model, len(members), job.now())
     return {"model": str(row.id), "segments": batch.size}
 
 
@@ -101,6 +106,12 @@ def _plan(job: RunningJob, payload: TrainRound) -> Plan:
     with job.worker.database.read() as session:
         round_row = rounds.find(session, payload.round)
         return Plan(projects.find(session, round_row.project_id), round_row, payload.strategy, stages)
+
+
+def _family(project: ProjectRow) -> Family:
+    if project.family is None:
+        raise NoModelFamily(project.id)
+    return family_named(project.family)
 
 
 def _labels(job: RunningJob, plan: Plan, split: str) -> SegmentBatch | None:
@@ -129,6 +140,7 @@ def _train_stage(job: RunningJob, plan: Plan, kind: str, member: int, labeled: S
     trained = _trained(job, kind, member, blob, {"loss": result.final_loss})
     with job.transaction() as session:
         registry.register(session, plan.project.id, plan.round.id, trained, plan.round.watermark, job.now())
+        jobs.made_progress(session, job.lease)
         name = f"{kind}-{member}" if kind == "ensemble" else kind
         rounds.stage_done(session, plan.round.id, name, time.monotonic() - started)
 

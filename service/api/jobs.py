@@ -4,7 +4,6 @@ from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Depends, Query
-from sqlalchemy import select
 
 from api_schemas.base import Page
 from api_schemas.events import Event
@@ -20,8 +19,15 @@ router = APIRouter(tags=["jobs"], dependencies=[Depends(requires("read"))])
 @router.get("/jobs")
 def list_jobs(project: UUID, session: ReadSession, cursor: Cursor = None, limit: PageSize = 100) -> Page[Job]:
     projects.find(session, project)
-    statement = select(JobRow).where(JobRow.project_id == project)
-    rows, after = page(session, statement, (JobRow.created_at, JobRow.id), cursor, limit, newest_first=True)
+    rows, after = page(
+        session,
+        JobRow,
+        [JobRow.project_id == project],
+        (JobRow.created_at, JobRow.id),
+        cursor,
+        limit,
+        newest_first=True,
+    )
     return Page(items=[jobs.describe(row) for row in rows], next=after)
 
 
@@ -38,9 +44,8 @@ def list_events(
     cursor: Cursor = None,
     limit: PageSize = 100,
 ) -> Page[Event]:
-    statement = select(EventRow)
     if project is not None:
         projects.find(session, project)
-        statement = statement.where(EventRow.project_id == project)
-    rows, after = page(session, statement, (EventRow.id,), cursor, limit, newest_first=newest)
+    where = [] if project is None else [EventRow.project_id == project]
+    rows, after = page(session, EventRow, where, (EventRow.id,), cursor, limit, newest_first=newest)
     return Page(items=[events.describe(row) for row in rows], next=after)

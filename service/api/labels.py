@@ -3,7 +3,6 @@
 from uuid import UUID
 
 from fastapi import APIRouter, Depends
-from sqlalchemy import select
 
 from api_schemas.base import Page
 from api_schemas.environments import Spaces
@@ -34,8 +33,7 @@ def add_labels(request: LabelsRequest, held: ServicesDep, now: Now) -> LabelsAcc
 @router.get("", dependencies=[reader])
 def list_labels(project: UUID, session: ReadSession, cursor: Cursor = None, limit: PageSize = 100) -> Page[Label]:
     projects.find(session, project)
-    statement = select(LabelRow).where(LabelRow.project_id == project)
-    rows, after = page(session, statement, (LabelRow.watermark,), cursor, limit)
+    rows, after = page(session, LabelRow, [LabelRow.project_id == project], (LabelRow.watermark,), cursor, limit)
     return Page(items=[labels.describe(row) for row in rows], next=after)
 
 

@@ -3,7 +3,6 @@
 from uuid import UUID
 
 from fastapi import APIRouter, Depends, Response
-from sqlalchemy import select
 
 from api_schemas.base import Page
 from api_schemas.projects import Project, ProjectCreate, ProjectPatch
@@ -25,7 +24,7 @@ def create_project(request: ProjectCreate, session: WriteSession, now: Now, resp
 
 @router.get("", dependencies=[reader])
 def list_projects(session: ReadSession, now: Now, cursor: Cursor = None, limit: PageSize = 100) -> Page[Project]:
-    rows, after = page(session, select(ProjectRow), (ProjectRow.created_at, ProjectRow.id), cursor, limit)
+    rows, after = page(session, ProjectRow, [], (ProjectRow.created_at, ProjectRow.id), cursor, limit)
     return Page(items=[projects.describe(session, row, now) for row in rows], next=after)
 
 

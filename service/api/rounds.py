@@ -5,7 +5,6 @@ from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Depends, Header, Response
-from sqlalchemy import select
 
 from api_schemas.base import Page
 from api_schemas.models import ModelVersion
@@ -23,15 +22,16 @@ reader, admin = Depends(requires("read")), Depends(requires("admin"))
 def start_round(request: RoundCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Round:
     project = projects.find(session, request.project, lock=True)
     row = rounds.request(session, project, now, held.settings.job_max_attempts)
-    response.headers["Location"] = f"/rounds/{row.id}"
+    response.headers.update({"Location": f"/rounds/{row.id}", "Retry-After": "1"})
     return rounds.describe(session, row)
 
 
 @router.get("/rounds", dependencies=[reader])
 def list_rounds(project: UUID, session: ReadSession, cursor: Cursor = None, limit: PageSize = 100) -> Page[Round]:
     projects.find(session, project)
-    statement = select(RoundRow).where(RoundRow.project_id == project)
-    rows, after = page(session, statement, (RoundRow.number,), cursor, limit, newest_first=True)
+    rows, after = page(
+        session, RoundRow, [RoundRow.project_id == project], (RoundRow.number,), cursor, limit, newest_first=True
+    )
     return Page(items=[rounds.describe(session, row) for row in rows], next=after)
 
 
@@ -55,9 +55,10 @@ def list_models(
     project: UUID, session: ReadSession, cursor: Cursor = None, limit: PageSize = 100
 ) -> Page[ModelVersion]:
     projects.find(session, project)
-    statement = select(ModelVersionRow).where(ModelVersionRow.project_id == project)
     key = (ModelVersionRow.created_at, ModelVersionRow.id)
-    rows, after = page(session, statement, key, cursor, limit, newest_first=True)
+    rows, after = page(
+        session, ModelVersionRow, [ModelVersionRow.project_id == project], key, cursor, limit, newest_first=True
+    )
     return Page(items=[registry.describe(row) for row in rows], next=after)
 
 

@@ -7,7 +7,6 @@ from uuid import UUID
 from fastapi import APIRouter, Depends, Response
 from fastapi.responses import JSONResponse, RedirectResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
-from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
@@ -17,7 +16,7 @@ from service import keys, projects, rounds
 from service.api.dependencies import Now, ReadSession, Services, ServicesDep, WriteSession, requires
 from service.log import get_logger
 from service.store.queries import jobs as job_queries
-from service.store.tables import ProjectRow
+from service.store.queries import pool as pool_queries
 
 router = APIRouter(tags=["system"])
 reader, admin = Depends(requires("read")), Depends(requires("admin"))
@@ -90,7 +89,7 @@ def _gauges(session: Session, now: datetime) -> CollectorRegistry:
         jobs.labels(queue, state).set(count)
     segments = Gauge("asim_segments", "Pool segments by state", ["project", "state"], registry=registry)
     loss = Gauge("asim_model_error_loss", "Next-state loss of the newest round, nats", ["project"], registry=registry)
-    for row in session.scalars(select(ProjectRow)):
+    for row in pool_queries.projects_in_order(session):
         counts = projects.describe(session, row, now).counts
         for state in ("unlabeled", "leased", "labeled"):
             segments.labels(row.name, state).set(getattr(counts, state))

@@ -4,7 +4,6 @@ from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Depends, Query, Response, UploadFile
-from sqlalchemy import select
 
 from api_schemas.base import Page
 from api_schemas.collections import CollectionCreate
@@ -46,8 +45,9 @@ def list_trajectories(
     project: UUID, session: ReadSession, cursor: Cursor = None, limit: PageSize = 100
 ) -> Page[Trajectory]:
     projects.find(session, project)
-    statement = select(MembershipRow).where(MembershipRow.project_id == project)
-    rows, after = page(session, statement, (MembershipRow.id,), cursor, limit)
+    rows, after = page(
+        session, MembershipRow, [MembershipRow.project_id == project], (MembershipRow.id,), cursor, limit
+    )
     ids = [row.trajectory_id for row in rows]
     contents = pool_queries.contents(session, ids)
     labeled = label_queries.labeled_by_trajectory(session, project, ids)
@@ -91,7 +91,7 @@ def trajectory_provenance(
 @router.post("/collections", status_code=202, dependencies=[admin])
 def collect(request: CollectionCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Job:
     row = collections.request(session, request, now, held.settings.job_max_attempts)
-    response.headers["Location"] = f"/jobs/{row.id}"
+    response.headers.update({"Location": f"/jobs/{row.id}", "Retry-After": "1"})
     return jobs.describe(row)
 
 

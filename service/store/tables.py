@@ -3,7 +3,7 @@
 from datetime import UTC, datetime
 from uuid import UUID, uuid4
 
-from sqlalchemy import JSON, DateTime, Dialect, ForeignKey, Index, MetaData, String, TypeDecorator, Uuid
+from sqlalchemy import JSON, DateTime, Dialect, ForeignKey, Index, MetaData, String, TypeDecorator, Uuid, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 NAMING = {
@@ -53,14 +53,14 @@ class ProjectRow(Row):
     name: Mapped[str] = mapped_column(String(80), unique=True)
     environment: Mapped[dict[str, object]]
     spaces: Mapped[dict[str, object]]
-    family: Mapped[str] = mapped_column(String(40))
+    family: Mapped[str | None] = mapped_column(String(40))
     segment_length: Mapped[int]
     stride: Mapped[int]
     held_out_fraction: Mapped[float]
     seed: Mapped[int]
     policy: Mapped[dict[str, object]]
     label_watermark: Mapped[int] = mapped_column(default=0)
-    round_watermark: Mapped[int] = mapped_column(default=0)  # pool labels that rounds were requested for
+    labels_at_round: Mapped[int] = mapped_column(default=0)  # pool_labels when the last round was requested
     pool_labels: Mapped[int] = mapped_column(default=0)
     token: Mapped[int] = mapped_column(default=0)
     created_at: Mapped[datetime]
@@ -213,7 +213,16 @@ class RoundRow(Row):
     error: Mapped[str | None]
     created_at: Mapped[datetime]
     finished_at: Mapped[datetime | None]
-    __table_args__ = (Index("uq_round_number", "project_id", "number", unique=True),)
+    __table_args__ = (
+        Index("uq_round_number", "project_id", "number", unique=True),
+        Index(
+            "uq_round_current",
+            "project_id",
+            unique=True,
+            sqlite_where=text("status = 'current'"),
+            postgresql_where=text("status = 'current'"),
+        ),
+    )
 
 
 class ModelVersionRow(Row):

@@ -107,7 +107,7 @@ def test_eight_labelers_at_once_get_disjoint_batches(on_both: Served) -> None:
     on_both.acquire(project)
 
     def take(_: int) -> list[Json]:
-        client = TestClient(on_both.app, base_url="http://127.0.0.1")
+        client = TestClient(on_both.app, base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
         given = [client.post("/acquire", json={"project": project, "count": 2}) for _ in range(3)]
         return [answer.json() for answer in given if answer.status_code == 201]
 
@@ -288,6 +288,13 @@ def test_a_drained_queue_is_selected_again_without_scoring_again(start: Serve) -
     assert len(set(offered)) == len(offered) == 14
     kinds = [job["kind"] for job in served.get("/jobs", project=project)["items"]]
     assert kinds.count("score_shard") == kinds.count("merge_scores") == 1
+
+
+def test_the_largest_batch_is_given(on_postgres: Served) -> None:
+    project = on_postgres.project()
+    on_postgres.upload(project, room(0, transitions=10_000))
+    assert len(set(segments(on_postgres.acquire(project, 10_000)))) == 10_000
+    refused(on_postgres.ask(project, 10_001), 422, "malformed-request", "count", 10_001)
 
 
 def test_many_shards_make_one_queue(start: Serve) -> None:

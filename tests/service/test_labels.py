@@ -338,7 +338,7 @@ def test_labelers_at_once_store_each_segment_once_in_one_order(on_both: Served) 
     items = free(on_both, project)
 
     def send(offset: int) -> Json:
-        client = TestClient(on_both.app, base_url="http://127.0.0.1")
+        client = TestClient(on_both.app, base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
         turned = items[offset:] + items[:offset]
         answers = [client.post("/labels", json={"project": project, "items": [item]}) for item in turned]
         assert {answer.status_code for answer in answers} == {201}

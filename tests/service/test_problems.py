@@ -64,7 +64,9 @@ def test_a_failure_of_ours_is_a_problem_that_tells_nothing(served: Served, monke
         raise ZeroDivisionError("secret of the house")
 
     monkeypatch.setattr("service.projects.find", broken)
-    client = TestClient(served.app, base_url="http://127.0.0.1", raise_server_exceptions=False)
+    client = TestClient(
+        served.app, base_url="http://127.0.0.1", client=("127.0.0.1", 50000), raise_server_exceptions=False
+    )
     answer = client.get(f"/projects/{UNKNOWN}")
     refused(answer, 500, "internal-error")
     assert "secret" not in answer.text

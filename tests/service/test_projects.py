@@ -45,7 +45,9 @@ def test_a_name_is_taken_once_by_all_who_ask_at_once(on_both: Served) -> None:
     name = uuid4().hex
 
     def ask(_: int) -> int:
-        client = TestClient(on_both.app, base_url="http://127.0.0.1", raise_server_exceptions=False)
+        client = TestClient(
+            on_both.app, base_url="http://127.0.0.1", client=("127.0.0.1", 50000), raise_server_exceptions=False
+        )
         return client.post("/projects", json={"name": name, "environment": ROOM}).status_code
 
     with ThreadPoolExecutor(6) as threads:

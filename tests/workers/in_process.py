@@ -66,7 +66,7 @@ class Loop:
     name: str = "rooms"  # of the project that the methods are about
 
     def __post_init__(self) -> None:
-        self._http = TestClient(create_app(self.settings, self.clock), base_url=ADDRESS)
+        self._http = TestClient(create_app(self.settings, self.clock), base_url=ADDRESS, client=("127.0.0.1", 50000))
         self._http.__enter__()
         self.client = Client(ADDRESS, transport=InProcess(self._http))
         self.worker = self.another_worker()

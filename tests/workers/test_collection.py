@@ -12,7 +12,7 @@ from asim.errors import ServiceError
 from service.store import codec
 from tests.workers.conftest import ROOM, OpenLoop, new_project
 from tests.workers.in_process import Loop
-from workers.labeling import explain
+from workers.explanation import explain
 from workers.simulators.base import Action, Step
 from workers.simulators.catalog import make_simulator
 from workers.simulators.minigrid import MiniGridSimulator

@@ -13,7 +13,8 @@ from api_schemas.labels import Label
 from tests.workers.conftest import ROOM, OpenLoop
 from tests.workers.in_process import Loop, segments_of
 from workers import labeling
-from workers.labeling import UnexplainedStep, explain, run_labeling
+from workers.explanation import explain
+from workers.labeling import UnexplainedStep, run_labeling
 from workers.simulators.catalog import make_simulator
 from workers.simulators.minigrid import ACTION_NAMES, DROP, NOTHING
 

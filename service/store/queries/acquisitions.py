@@ -11,13 +11,15 @@ from service.store.queries.pool import live_claim
 from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, LabelRow, QueueRow, ScoringRow, ShardRow
 
 
-def newest_scoring(session: Session, project_id: UUID, strategy: str, round_id: UUID | None) -> ScoringRow | None:
-    """The youngest scoring of a strategy under a round that has not failed."""
+def newest_scoring(
+    session: Session, project_id: UUID, strategy: str, round_id: UUID | None, status: str | None = None
+) -> ScoringRow | None:
+    """The youngest scoring of a strategy under a round that has not failed, or that has this status."""
     statement = select(ScoringRow).where(
         ScoringRow.project_id == project_id,
         ScoringRow.strategy == strategy,
         ScoringRow.round_id == round_id if round_id else ScoringRow.round_id.is_(None),
-        ScoringRow.status != "failed",
+        ScoringRow.status != "failed" if status is None else ScoringRow.status == status,
     )
     return session.scalar(statement.order_by(ScoringRow.created_at.desc()).limit(1))
 
@@ -45,12 +47,12 @@ def free_queue(session: Session, scoring: ScoringRow, count: int, now: datetime)
 
 
 def take_claims(session: Session, claims: Sequence[ClaimRow]) -> None:
-    """Write claims of one project over the expired ones of the same segments, in two statements for any number."""
+    """Write claims of one project over the expired ones of the same segments, a few statements for any number."""
     segments = [(claim.trajectory_id, claim.start) for claim in claims]
-    stale = and_(
-        ClaimRow.project_id == claims[0].project_id, tuple_(ClaimRow.trajectory_id, ClaimRow.start).in_(segments)
-    )
-    session.execute(delete(ClaimRow).where(stale).execution_options(synchronize_session=False))
+    for i in range(0, len(segments), 500):  # PostgreSQL bounds the depth of a statement
+        named = tuple_(ClaimRow.trajectory_id, ClaimRow.start).in_(segments[i : i + 500])
+        stale = delete(ClaimRow).where(ClaimRow.project_id == claims[0].project_id, named)
+        session.execute(stale.execution_options(synchronize_session=False))
     session.add_all(claims)
 
 

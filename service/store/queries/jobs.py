@@ -28,9 +28,11 @@ def higher_waiting(session: Session, queues: Sequence[str], priority: int, now: 
     return session.scalar(statement.limit(1)) is not None
 
 
-def unfinished(session: Session, subject_id: UUID) -> JobRow | None:
-    """A queued or running job that works on the subject."""
+def unfinished(session: Session, subject_id: UUID, kind: str | None = None) -> JobRow | None:
+    """A queued or running job, of this kind or of any, that works on the subject."""
     statement = select(JobRow).where(JobRow.subject_id == subject_id, JobRow.state.in_(("queued", "running")))
+    if kind is not None:
+        statement = statement.where(JobRow.kind == kind)
     return session.scalar(statement.order_by(JobRow.created_at).limit(1))
 
 

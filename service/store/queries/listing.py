@@ -3,9 +3,10 @@
 import base64
 import binascii
 import json
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from sqlalchemy import BindParameter, Select, literal, tuple_
+from sqlalchemy import BindParameter, ColumnElement, literal, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from service.errors import InvalidField
@@ -15,7 +16,8 @@ R = TypeVar("R")
 
 def page(
     session: Session,
-    statement: Select[R],
+    row: type[R],
+    where: Sequence[ColumnElement[bool]],
     key: tuple[InstrumentedAttribute[Any], ...],
     cursor: str | None,
     limit: int,
@@ -23,6 +25,7 @@ def page(
     newest_first: bool = False,
 ) -> tuple[list[R], str | None]:
     """Rows after `cursor` in the order of `key`, and the cursor of the next page. Raises InvalidField."""
+    statement = select(row).where(*where)
     if cursor is not None:
         after = tuple_(*[_parse(column, value) for column, value in zip(key, _decode(cursor, len(key)), strict=True)])
         statement = statement.where(tuple_(*key) < after if newest_first else tuple_(*key) > after)

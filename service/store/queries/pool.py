@@ -9,7 +9,7 @@ from sqlalchemy import ColumnElement, and_, func, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
-from service.store.tables import ClaimRow, LabelRow, MembershipRow, TrajectoryRow
+from service.store.tables import ClaimRow, LabelRow, MembershipRow, ProjectRow, TrajectoryRow
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,16 @@ def keep_content(session: Session, row: TrajectoryRow) -> None:
     insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
     values = {column.key: getattr(row, column.key) for column in TrajectoryRow.__table__.columns}
     session.execute(insert(TrajectoryRow).values(values).on_conflict_do_nothing())
+
+
+def projects_in_order(session: Session) -> Sequence[ProjectRow]:
+    """All projects, oldest first."""
+    return session.scalars(select(ProjectRow).order_by(ProjectRow.created_at)).all()
+
+
+def project_named(session: Session, name: str) -> ProjectRow | None:
+    """The project of that name."""
+    return session.scalar(select(ProjectRow).where(ProjectRow.name == name))
 
 
 def contents(session: Session, trajectory_ids: Sequence[str]) -> dict[str, TrajectoryRow]:

@@ -14,6 +14,11 @@ def current_round(session: Session, project_id: UUID) -> RoundRow | None:
     return session.scalar(select(RoundRow).where(RoundRow.project_id == project_id, RoundRow.status == "current"))
 
 
+def queued_rounds(session: Session, project_id: UUID) -> Sequence[RoundRow]:
+    """Rounds whose job no worker has begun."""
+    return session.scalars(select(RoundRow).where(RoundRow.project_id == project_id, RoundRow.status == "queued")).all()
+
+
 def last_number(session: Session, project_id: UUID) -> int:
     """Number of the project's youngest round; 0 before the first."""
     return session.scalar(select(func.max(RoundRow.number)).where(RoundRow.project_id == project_id)) or 0

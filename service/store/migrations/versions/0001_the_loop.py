@@ -12,7 +12,6 @@ depends_on = None
 
 
 def upgrade() -> None:
-
     op.create_table(
         "api_key",
         sa.Column("id", sa.Uuid(), nullable=False),
@@ -40,14 +39,14 @@ def upgrade() -> None:
         sa.Column("name", sa.String(length=80), nullable=False),
         sa.Column("environment", sa.JSON(none_as_null=True), nullable=False),
         sa.Column("spaces", sa.JSON(none_as_null=True), nullable=False),
-        sa.Column("family", sa.String(length=40), nullable=False),
+        sa.Column("family", sa.String(length=40), nullable=True),
         sa.Column("segment_length", sa.Integer(), nullable=False),
         sa.Column("stride", sa.Integer(), nullable=False),
         sa.Column("held_out_fraction", sa.Double(), nullable=False),
         sa.Column("seed", sa.Integer(), nullable=False),
         sa.Column("policy", sa.JSON(none_as_null=True), nullable=False),
         sa.Column("label_watermark", sa.Integer(), nullable=False),
-        sa.Column("round_watermark", sa.Integer(), nullable=False),
+        sa.Column("labels_at_round", sa.Integer(), nullable=False),
         sa.Column("pool_labels", sa.Integer(), nullable=False),
         sa.Column("token", sa.Integer(), nullable=False),
         sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
@@ -199,6 +198,13 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("id", name=op.f("pk_round")),
     )
     with op.batch_alter_table("round", schema=None) as batch_op:
+        batch_op.create_index(
+            "uq_round_current",
+            ["project_id"],
+            unique=True,
+            sqlite_where=sa.text("status = 'current'"),
+            postgresql_where=sa.text("status = 'current'"),
+        )
         batch_op.create_index("uq_round_number", ["project_id", "number"], unique=True)
 
     op.create_table(
@@ -280,7 +286,6 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-
     op.drop_table("shard")
     with op.batch_alter_table("queue", schema=None) as batch_op:
         batch_op.drop_index("ix_queue_segment")
@@ -298,6 +303,11 @@ def downgrade() -> None:
     op.drop_table("acquisition_item")
     with op.batch_alter_table("round", schema=None) as batch_op:
         batch_op.drop_index("uq_round_number")
+        batch_op.drop_index(
+            "uq_round_current",
+            sqlite_where=sa.text("status = 'current'"),
+            postgresql_where=sa.text("status = 'current'"),
+        )
 
     op.drop_table("round")
     with op.batch_alter_table("membership", schema=None) as batch_op:
