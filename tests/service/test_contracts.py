@@ -30,10 +30,11 @@ def test_spaces_are_those_of_the_simulator(options: dict[str, object]) -> None:
     simulator = make_simulator("minigrid", options)
     spaces = SIMULATOR_SPACES["minigrid"](options)
     expected = {
-        name: Stream.model_validate({"dtype": str(space.dtype), "shape": space.shape})
+        name: Stream(dtype="uint8", shape=space.shape or (), high=tuple(size - 1 for size in minigrid.CHANNEL_SIZES))
         for name, space in simulator.observation_space.items()
     }
     assert spaces.observations == expected
+    assert {str(space.dtype) for space in simulator.observation_space.values()} == {"uint8"}
     assert isinstance(simulator.action_space, gym.spaces.Discrete)
     assert isinstance(spaces.actions, DiscreteActions)
     assert spaces.actions.n == simulator.action_space.n

@@ -114,9 +114,9 @@ def test_a_users_own_robot_keeps_its_spaces(served: Served) -> None:
     project = create(served, environment=ROBOT, segment_length=4, stride=6).json()
     assert project["environment"]["spaces"] == {
         "observations": {
-            "front": {"dtype": "uint8", "shape": [64, 64, 3]},
-            "wrist": {"dtype": "uint8", "shape": [64, 64, 3]},
-            "proprioception": {"dtype": "float32", "shape": [9]},
+            "front": {"dtype": "uint8", "shape": [64, 64, 3], "high": None},
+            "wrist": {"dtype": "uint8", "shape": [64, 64, 3], "high": None},
+            "proprioception": {"dtype": "float32", "shape": [9], "high": None},
         },
         "actions": {"kind": "box", "shape": [7], "low": -1.0, "high": 1.0},
     }

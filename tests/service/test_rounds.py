@@ -59,7 +59,10 @@ def test_a_round_asked_for_is_queued_on_all_labels_so_far(on_both: Served) -> No
 
 def test_a_round_is_shown_as_it_goes_and_the_next_takes_its_place(on_both: Served) -> None:
     project = labeled(on_both)
-    first, second = requested(on_both, project), requested(on_both, project)
+    first = requested(on_both, project)
+    with on_both.services.database.write() as session:
+        rounds.begin_training(session, first)
+    second = requested(on_both, project)
     with on_both.services.database.write() as session:
         now = on_both.clock()
         for number, one in enumerate((first, second)):

@@ -82,8 +82,8 @@ def test_a_trajectory_says_what_it_is(served: Served) -> None:
     receipt = served.upload(project, GOOD)[0]
     shown = served.get(f"/trajectories/{receipt['id']}", project=project)
     assert shown["streams"] == {
-        "grid": {"dtype": "uint8", "shape": [6, 6, 3]},
-        "carried": {"dtype": "uint8", "shape": [3]},
+        "grid": {"dtype": "uint8", "shape": [6, 6, 3], "high": [10, 5, 4]},
+        "carried": {"dtype": "uint8", "shape": [3], "high": [10, 5, 4]},
     }
     assert (shown["transitions"], shown["segments"], shown["labeled"]) == (5, 5, 0)
     assert (shown["split"], shown["has_provenance"]) == ("pool", False)

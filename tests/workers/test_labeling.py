@@ -1,4 +1,4 @@
-"""The labeling worker: the simulator explains every step, or nothing is posted."""
+"""The labeling worker: the simulator explains every step that it labels."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -115,7 +115,7 @@ def test_a_held_out_acquisition_is_labeled_like_any_other(labeled: Loop) -> None
     assert labeled.project.counts.held_out_labeled == before + 5
 
 
-def test_an_observation_that_no_action_explains_stops_the_answer(
+def test_an_observation_that_no_action_explains_is_given_back_and_the_others_are_labeled(
     labeled: Loop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batch = labeled.acquire(10, "random")
@@ -124,8 +124,10 @@ def test_an_observation_that_no_action_explains_stops_the_answer(
     _bend(monkeypatch, labeled, lambda item: item == (bent.trajectory, bent.start))
     with pytest.raises(UnexplainedStep, match=f"segment {bent.trajectory}:{bent.start}, step 0: no action reproduces"):
         run_labeling(labeled.client, batch, np.random.default_rng(0))
-    assert labeled.project.label_watermark == before
-    assert not any(item.labeled for item in labeled.client.acquisition(batch.id).items)
+    assert labeled.project.label_watermark == before + 9
+    answered = labeled.client.acquisition(batch.id)
+    assert [item.rank for item in answered.items if not item.labeled] == [6]
+    assert (answered.status, labeled.project.counts.leased) == ("released", 0)
 
 
 def test_explain_gives_nothing_where_even_the_best_action_misses() -> None:

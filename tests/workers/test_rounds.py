@@ -12,7 +12,7 @@ from api_schemas.rounds import Round
 from models import checkpoints
 from models.families import GRID
 from models.training import TrainingResult
-from service import reaper, registry
+from service import jobs, reaper, registry
 from service.errors import MissingBlob
 from service.store.queries import labels as label_queries
 from service.store.tables import ModelVersionRow, ScoringRow
@@ -177,7 +177,7 @@ def test_what_a_silent_worker_writes_after_its_lease_is_refused(labeled: Loop, m
     done = labeled.client.round(asked.id)
     (job,) = labeled.jobs("train_round")
     assert (done.status, [stage.name for stage in done.stages]) == ("current", STAGES)
-    assert (job.state, job.attempts) == ("done", 2)
+    assert (job.state, job.attempts) == ("done", 1)  # a stage was stored: attempts count from there
     assert len(calls) == 3
     assert len({model.id for model in labeled.client.models(labeled.project.id) if model.round == asked.id}) == 2
 
@@ -329,3 +329,37 @@ def _fails_scoring(loop: Loop, spoil: Callable[[Any], None]) -> str:
 
 def _generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+def test_a_queue_is_ranked_before_the_next_round_trains(labeled: Loop) -> None:
+    first = start(labeled)
+    run_next(labeled.worker)  # the first round has trained; its scoring waits
+    labeled.label(10, "random")
+    second = start(labeled)
+    run_next(labeled.worker)
+    run_next(labeled.worker)
+    assert [labeled.client.round(asked.id).status for asked in (first, second)] == ["current", "queued"]
+
+
+def test_an_overtaken_round_trains_nothing(labeled: Loop) -> None:
+    first = start(labeled)
+    labeled.label(10, "random")
+    second = start(labeled)
+    labeled.drain()
+    assert [labeled.client.round(asked.id).status for asked in (first, second)] == ["superseded", "current"]
+    assert {model.round for model in labeled.client.models(labeled.project.id)} == {second.id, None}
+
+
+def test_attempts_are_counted_from_the_last_stored_stage(labeled: Loop) -> None:
+    asked = start(labeled)
+    for _ in range(2 * labeled.settings.job_max_attempts):
+        with labeled.worker.database.write() as session:
+            row = jobs.claim_next(session, ("train",), "killed", labeled.clock(), 15.0)
+            assert row is not None
+            jobs.made_progress(session, jobs.lease_of(row))
+        labeled.clock.advance(100)  # the worker says nothing more
+        with labeled.worker.database.write() as session:
+            reaper.reap(session, labeled.clock())
+        labeled.clock.advance(100)
+    labeled.drain()
+    assert labeled.client.round(asked.id).status == "current"
