@@ -3,11 +3,14 @@
 from collections.abc import Callable, Mapping
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, PositiveInt, ValidationError, model_validator
 
 from api_schemas.base import Schema
 
 DType = Literal["uint8", "int32", "int64", "float32", "float64"]
+
+
+StreamName = Annotated[str, Field(pattern="^[A-Za-z0-9_.-]{1,80}$")]  # a slash would name a chunk of another stream
 
 
 class Stream(Schema):
@@ -17,7 +20,7 @@ class Stream(Schema):
     """
 
     dtype: DType
-    shape: tuple[int, ...]
+    shape: tuple[PositiveInt, ...]
     high: int | tuple[int, ...] | None = None
 
     @model_validator(mode="after")
@@ -51,7 +54,7 @@ Actions = Annotated[DiscreteActions | BoxActions, Field(discriminator="kind")]
 class Spaces(Schema):
     """What an observation and an action of a project look like."""
 
-    observations: dict[str, Stream] = Field(min_length=1)
+    observations: dict[StreamName, Stream] = Field(min_length=1)
     actions: Actions
 
 

@@ -28,7 +28,7 @@ class LabelItem(Schema):
     trajectory: TrajectoryId
     start: int = Field(ge=0)
     actions: list[Action] = Field(min_length=1)
-    action_sets: list[list[int]] | None = None
+    action_sets: list[list[StrictInt]] | None = None
     residual: float | None = Field(default=None, ge=0)
 
 
@@ -41,7 +41,7 @@ class LabeledTrajectory(Schema):
 
     content: Base64Bytes
     actions: list[Action] = Field(min_length=1)
-    action_sets: list[list[int]] | None = None
+    action_sets: list[list[StrictInt]] | None = None
     starts: list[int] | None = None
     split: SplitChoice = "auto"
 

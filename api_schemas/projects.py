@@ -30,11 +30,11 @@ class LabelingPolicy(Schema):
 class ProjectCreate(Schema):
     """Segments are windows of `segment_length` transitions, `stride` apart, so they never overlap."""
 
-    name: str = Field(min_length=1, max_length=80, pattern=r"^[^\s/](?:[^/\n]*[^\s/])?$")
+    name: str = Field(min_length=1, max_length=80, pattern=r"^[^\s/\x00-\x1f](?:[^/\x00-\x1f]*[^\s/\x00-\x1f])?$")
     environment: Environment
     family: Family | None = Field(default=None, description="default: the one that takes the spaces, if any does")
-    segment_length: int = Field(default=1, ge=1)
-    stride: int | None = Field(default=None, ge=1, description="default: segment_length")
+    segment_length: int = Field(default=1, ge=1, le=1_000_000)
+    stride: int | None = Field(default=None, ge=1, le=1_000_000, description="default: segment_length")
     held_out_fraction: float = Field(default=0.1, ge=0, lt=1)
     seed: int = Field(default=0, ge=0, lt=2**31)
     policy: LabelingPolicy = LabelingPolicy()
