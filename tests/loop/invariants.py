@@ -38,6 +38,11 @@ def check_invariants(client: Client, data_folder: Path, acknowledged: Iterable[S
     _check_blobs(data_folder)
 
 
+def retries(client: Client, job: UUID | None) -> int:
+    """How often the job lost its worker. Its attempts do not tell: they are counted from the last stored stage."""
+    return sum(event.kind == "job.retried" and event.data["job"] == str(job) for event in client.events())
+
+
 def _check_labels(client: Client, project: UUID, acknowledged: Iterable[Segment]) -> None:
     listed = Counter((label.trajectory, label.start) for label in client.labels(project))
     assert repeated(listed) == [], "labels listed twice"
