@@ -8,6 +8,7 @@ from api_schemas.base import Page
 from api_schemas.environments import Spaces
 from api_schemas.labels import Label, LabelsAccepted, LabelsRequest
 from service import labels, pool, projects
+from service.actions import check_actions
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep, requires
 from service.errors import InvalidField
 from service.labels import LabeledUpload
@@ -42,7 +43,7 @@ def _store_trajectories(held: Services, spaces: Spaces, request: LabelsRequest) 
     for position, trajectory in enumerate(request.trajectories):
         name = f"trajectories[{position}]"
         arrays = npz.parse(trajectory.content, f"{name}.content", held.settings.max_body_bytes)
-        labels.check_actions(spaces, trajectory.actions, trajectory.action_sets, name)
+        check_actions(spaces, trajectory.actions, trajectory.action_sets, name)
         stored = pool.store(held.blobs, spaces, arrays, name)
         uploads.append(
             LabeledUpload(stored, trajectory.actions, trajectory.action_sets, trajectory.starts, trajectory.split)
