@@ -54,9 +54,9 @@ def error_table(curves: Mapping[str, ModelErrorCurve], first_column: str = "proj
 
 
 def _error_cells(error: ModelError, groups: Sequence[str]) -> list[str]:
-    loss = "" if error.loss is None else f"{error.loss:.4f}"
+    loss = "-" if error.loss is None else f"{error.loss:.4f}"
     by_group = [error.by_group[group].dynamics_accuracy if group in error.by_group else None for group in groups]
-    return [loss, *("" if share is None else f"{share:.1%}" for share in (error.dynamics_accuracy, *by_group))]
+    return [loss, *("-" if share is None else f"{share:.1%}" for share in (error.dynamics_accuracy, *by_group))]
 
 
 def _table(first: str, *others: str) -> Table:

@@ -110,7 +110,8 @@ def _failure(outcome: httpx.Response | httpx.TransportError, request: httpx.Requ
         return service_error(_problem(outcome))
     reason = str(outcome) or type(outcome).__name__
     service = f"{request.url.scheme}://{request.url.netloc.decode()}"
-    return Unreachable(f"no answer from {service} to {request.method} {request.url.path}: {reason}")
+    asked = f"{request.method} {request.url.path}"
+    return Unreachable(f"no answer from {service} to {asked}: {reason}; does `asim serve` run there?")
 
 
 def _problem(answer: httpx.Response) -> Problem:

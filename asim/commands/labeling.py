@@ -42,6 +42,9 @@ def acquire(
         typer.echo(batch.model_dump_json(indent=2))
         return
     show(acquisition_table(batch))
+    if batch.strategy != batch.requested_strategy:
+        why = "no model family takes its spaces" if found.family is None else "no round has trained a model yet"
+        typer.echo(f"by {batch.strategy} and not by {batch.requested_strategy}: {why}", err=True)
     typer.echo(f"acquisition {batch.id}, token {batch.token}: {len(batch.items)} segments by {batch.strategy}")
     typer.echo(f"labels are due by {batch.lease_expires_at:%Y-%m-%d %H:%M:%S %Z} through POST {url}/labels")
 
@@ -107,6 +110,8 @@ def model_error(
             typer.echo(curve.model_dump_json())
     else:
         show(error_table(curves))
+    if any(point.model_error.loss is None for curve in curves.values() for point in curve.points):
+        typer.echo("-: there were no held-out labels; collect or import some with --split held_out", err=True)
     if plot is not None:
         from asim.figure import draw_learning_curves
 

@@ -50,7 +50,10 @@ def create(
         policy=LabelingPolicy.model_validate({field: value for field, value in policy.items() if value is not None}),
     )
     with connect(url, key) as client:
-        typer.echo(client.create_project(project).id)
+        created = client.create_project(project)
+    typer.echo(created.id)
+    if created.family is None:
+        typer.echo("no model family takes these spaces: the project keeps data and labels, trains nothing", err=True)
 
 
 @app.command("list")

@@ -50,11 +50,14 @@ def test_the_figure_of_a_project_without_rounds_is_empty_and_no_error(tmp_path: 
     assert (tmp_path / "empty.png").stat().st_size > 0
 
 
-def test_the_table_shows_each_round_and_leaves_unknown_numbers_blank() -> None:
+def test_the_table_shows_each_round_and_marks_unknown_numbers() -> None:
     console = Console(width=120, record=True, quiet=True)
     console.quiet = False
     with console.capture() as captured:
         console.print(error_table({"cycle": curve({200: 0.5, 300: 0.25})}, first_column="strategy"))
     lines = [line.split() for line in captured.get().splitlines() if line.strip()]
     assert lines[0] == ["strategy", "labels", "test", "loss", "Dynamics", "Accuracy", "movement", "interaction"]
-    assert lines[1:] == [["cycle", "200", "0.5000", "50.0%", "90.0%"], ["cycle", "300", "0.2500", "75.0%", "90.0%"]]
+    assert lines[1:] == [
+        ["cycle", "200", "0.5000", "50.0%", "90.0%", "-"],
+        ["cycle", "300", "0.2500", "75.0%", "90.0%", "-"],
+    ]
