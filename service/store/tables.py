@@ -3,8 +3,22 @@
 from datetime import UTC, datetime
 from uuid import UUID, uuid4
 
-from sqlalchemy import JSON, DateTime, Dialect, ForeignKey, Index, MetaData, String, TypeDecorator, Uuid, text
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    DateTime,
+    Dialect,
+    ForeignKey,
+    Index,
+    MetaData,
+    String,
+    TypeDecorator,
+    Uuid,
+    text,
+)
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+from service.store.horizon import CurrentTransaction
 
 NAMING = {
     "ix": "ix_%(column_0_label)s",
@@ -46,7 +60,10 @@ class Row(DeclarativeBase):
 
 
 class ProjectRow(Row):
-    """`label_watermark` counts accepted labels; `token` the leases given out. Both grow under this row's lock."""
+    """One project and its counters, which change under this row's lock only.
+
+    `label_watermark` counts accepted labels, `token` the leases given out; the others count the members of the splits.
+    """
 
     __tablename__ = "project"
     id: Mapped[UUID] = mapped_column(primary_key=True, default=uuid4)
@@ -62,6 +79,11 @@ class ProjectRow(Row):
     label_watermark: Mapped[int] = mapped_column(default=0)
     labels_at_round: Mapped[int] = mapped_column(default=0)  # pool_labels when the last round was requested
     pool_labels: Mapped[int] = mapped_column(default=0)
+    held_out_labels: Mapped[int] = mapped_column(default=0)
+    pool_trajectories: Mapped[int] = mapped_column(default=0)
+    pool_segments: Mapped[int] = mapped_column(default=0)
+    held_out_trajectories: Mapped[int] = mapped_column(default=0)
+    held_out_segments: Mapped[int] = mapped_column(default=0)
     token: Mapped[int] = mapped_column(default=0)
     created_at: Mapped[datetime]
 
@@ -89,7 +111,10 @@ class MembershipRow(Row):
     segments: Mapped[int]
     provenance_sha256: Mapped[str | None] = mapped_column(String(64))
     created_at: Mapped[datetime]
-    __table_args__ = (Index("uq_membership_trajectory", "project_id", "trajectory_id", unique=True),)
+    __table_args__ = (
+        Index("uq_membership_trajectory", "project_id", "trajectory_id", unique=True),
+        Index("ix_membership_split", "project_id", "split", "id"),
+    )
 
 
 class LabelRow(Row):
@@ -121,11 +146,13 @@ class AcquisitionRow(Row):
     __tablename__ = "acquisition"
     id: Mapped[UUID] = mapped_column(primary_key=True, default=uuid4)
     project_id: Mapped[UUID] = mapped_column(ForeignKey("project.id"), index=True)
+    mode: Mapped[str] = mapped_column(String(10), default="pool")
     purpose: Mapped[str] = mapped_column(String(10))
     strategy: Mapped[str] = mapped_column(String(40))
     requested_strategy: Mapped[str] = mapped_column(String(40))
     round_id: Mapped[UUID | None]
     status: Mapped[str] = mapped_column(String(10))
+    reason: Mapped[str | None]  # why the batch is smaller than was asked for
     labeler: Mapped[str] = mapped_column(String(200))
     token: Mapped[int]
     lease_expires_at: Mapped[datetime]
@@ -133,7 +160,11 @@ class AcquisitionRow(Row):
 
 
 class AcquisitionItemRow(Row):
-    """A segment of a batch, for ever; who may label it now is the claim's business."""
+    """A segment of a batch, for ever; who may label it now is the claim's business.
+
+    An explore item names the observation to start from and the `actions` to execute there; `answer` is the trajectory
+    that came of it.
+    """
 
     __tablename__ = "acquisition_item"
     acquisition_id: Mapped[UUID] = mapped_column(ForeignKey("acquisition.id"), primary_key=True)
@@ -141,10 +172,15 @@ class AcquisitionItemRow(Row):
     trajectory_id: Mapped[str] = mapped_column(String(64))
     start: Mapped[int]
     score: Mapped[float | None]
+    actions: Mapped[list[object] | None]
+    answer: Mapped[str | None] = mapped_column(String(64))
 
 
 class ClaimRow(Row):
-    """Who may label a segment: at most one row a segment, taken over when its lease has expired."""
+    """Who may label a segment: at most one row a segment, taken over when its lease has expired.
+
+    An explore item claims no segment: its row stands under the acquisition's id and the item's rank.
+    """
 
     __tablename__ = "claim"
     project_id: Mapped[UUID] = mapped_column(ForeignKey("project.id"), primary_key=True)
@@ -249,7 +285,7 @@ class JobRow(Row):
 
     __tablename__ = "job"
     id: Mapped[UUID] = mapped_column(primary_key=True, default=uuid4)
-    project_id: Mapped[UUID] = mapped_column(ForeignKey("project.id"), index=True)
+    project_id: Mapped[UUID | None] = mapped_column(ForeignKey("project.id"), index=True)  # None for a canary
     kind: Mapped[str] = mapped_column(String(40))
     queue: Mapped[str] = mapped_column(String(10))
     priority: Mapped[int] = mapped_column(default=0)
@@ -265,6 +301,8 @@ class JobRow(Row):
     not_before: Mapped[datetime | None]
     sent_at: Mapped[datetime | None]  # when a carrier was given the id; None is the outbox
     checkpoint_sha256: Mapped[str | None] = mapped_column(String(64))
+    checkpoint_stage: Mapped[str | None] = mapped_column(String(60))  # what the checkpoint is one of
+    correlation: Mapped[str] = mapped_column(String(100), default="")  # of the request that asked for the job
     progress: Mapped[float] = mapped_column(default=0.0)
     message: Mapped[str] = mapped_column(default="")
     result: Mapped[dict[str, object]]
@@ -276,15 +314,35 @@ class JobRow(Row):
 
 
 class EventRow(Row):
-    """Something that happened, in order of commit within a project."""
+    """Something that happened: who, when, what. `transaction` tells readers what may still be committed before it."""
 
     __tablename__ = "event"
     id: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     project_id: Mapped[UUID | None]
     kind: Mapped[str] = mapped_column(String(60))
     data: Mapped[dict[str, object]]
+    actor: Mapped[str] = mapped_column(String(200), default="")
+    correlation: Mapped[str] = mapped_column(String(100), default="")
+    transaction: Mapped[int] = mapped_column(BigInteger, default=CurrentTransaction())
     created_at: Mapped[datetime]
     __table_args__ = (Index("ix_event_project", "project_id", "id"),)
+
+
+class IdempotencyRow(Row):
+    """The answer to a request that carried an Idempotency-Key, kept so that a repetition gets the same one.
+
+    It is written in the transaction of what the request did: both are there, or neither.
+    """
+
+    __tablename__ = "idempotency"
+    caller: Mapped[str] = mapped_column(String(40), primary_key=True)
+    route: Mapped[str] = mapped_column(String(40), primary_key=True)
+    key: Mapped[str] = mapped_column(String(200), primary_key=True)
+    request_sha256: Mapped[str] = mapped_column(String(64))
+    status: Mapped[int | None]
+    location: Mapped[str | None] = mapped_column(String(200))
+    body: Mapped[str | None]
+    expires_at: Mapped[datetime] = mapped_column(index=True)
 
 
 class KeyRow(Row):
