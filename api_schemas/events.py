@@ -6,10 +6,16 @@ from api_schemas.base import Schema, Timestamp
 
 
 class Event(Schema):
-    """`id` grows by commit within a project; `data` depends on `kind`."""
+    """One state change. A listing by rising `id` never gets an event before an older one that it has not shown.
+
+    actor: who did it: the name of an API key, "local" in embedded mode, a worker, the reaper.
+    correlation: the `X-Correlation-ID` of the request that it goes back to. `data` depends on `kind`.
+    """
 
     id: int
     project: UUID | None
     kind: str
     data: dict[str, object]
+    actor: str
+    correlation: str
     created_at: Timestamp

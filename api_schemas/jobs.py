@@ -12,7 +12,7 @@ from api_schemas.strategies import StrategyName
 RUN_JOB = "asim.run_job"  # the one Celery task; its argument is a job id
 
 Queue = Literal["train", "score", "label", "default"]
-JobState = Literal["queued", "running", "done", "failed"]
+JobState = Literal["queued", "running", "done", "failed", "cancelled"]
 
 
 class Collect(Schema):
@@ -63,11 +63,19 @@ class SelectQueue(Schema):
     length: int
 
 
+class Canary(Schema):
+    """Do nothing: that it was done shows that `queue` is served. It belongs to no project."""
+
+    kind: Literal["canary"] = "canary"
+    queue: Queue
+
+
 JobPayload = Annotated[
-    Collect | TrainRound | TrainSubgoalGenerator | ScoreShard | MergeScores | SelectQueue, Field(discriminator="kind")
+    Collect | TrainRound | TrainSubgoalGenerator | ScoreShard | MergeScores | SelectQueue | Canary,
+    Field(discriminator="kind"),
 ]
 
-QUEUES: dict[str, Queue] = {
+QUEUES: dict[str, Queue] = {  # a canary names its own
     "collect": "label",
     "train_round": "train",
     "train_subgoal_generator": "train",
@@ -76,6 +84,7 @@ QUEUES: dict[str, Queue] = {
     "select_queue": "score",
 }
 PRIORITIES: dict[str, int] = {  # others 0; higher goes first
+    "canary": 100,
     "score_shard": 10,  # a queue that somebody waits for comes before the next training
     "merge_scores": 10,
     "select_queue": 10,
@@ -87,7 +96,7 @@ class Job(Schema):
     """A job as it stands. `progress` runs from 0 to 1; `error` says why it failed."""
 
     id: UUID
-    project: UUID
+    project: UUID | None  # None for a canary
     kind: str
     queue: Queue
     state: JobState

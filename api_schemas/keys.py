@@ -33,10 +33,15 @@ class KeyCreated(Key):
 
 
 class Health(Schema):
-    """State of the parts that the service needs."""
+    """State of the parts that the service needs.
+
+    canaries: by queue, seconds since a job that does nothing was last done; None where none was yet. A queue is served
+    while that is recent, or while one of its workers is at work on a job.
+    """
 
     status: Literal["ok", "unavailable"]
     database: bool
     blobs: bool
     workers_alive: int
+    canaries: dict[str, float | None]
     version: str

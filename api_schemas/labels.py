@@ -37,6 +37,7 @@ class LabeledTrajectory(Schema):
 
     content: base64 of an npz file with one array a stream, time first, T + 1 observations.
     actions: T actions. starts: record only the segments that begin there; default all of them.
+    rank: the explore item of the request's acquisition that this trajectory answers; None where nobody asked for it.
     """
 
     content: Base64Bytes
@@ -44,6 +45,7 @@ class LabeledTrajectory(Schema):
     action_sets: list[list[StrictInt]] | None = None
     starts: list[int] | None = None
     split: SplitChoice = "auto"
+    rank: int | None = Field(default=None, ge=0)
 
 
 class LabelsRequest(Schema):

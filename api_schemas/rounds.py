@@ -5,7 +5,7 @@ from uuid import UUID
 
 from api_schemas.base import Schema, Timestamp
 
-RoundStatus = Literal["queued", "training", "scoring", "current", "superseded", "failed"]
+RoundStatus = Literal["queued", "training", "scoring", "current", "superseded", "failed", "cancelled"]
 
 
 class RoundCreate(Schema):

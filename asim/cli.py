@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from asim.commands import keys, labeling, processes, projects
+from asim.commands import keys, labeling, processes, projects, work
 from asim.commands.console import explain
 
 app = typer.Typer(
@@ -24,6 +24,9 @@ app.command("acquire")(labeling.acquire)
 app.command("label")(labeling.label)
 app.command("round")(labeling.start_round)
 app.command("error")(labeling.model_error)
+app.command("jobs")(work.jobs)
+app.command("cancel")(work.cancel)
+app.command("events")(work.events)
 
 
 def main() -> None:

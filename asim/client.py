@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Self, TypeVar
-from uuid import UUID
+from uuid import UUID, uuid4
 
 import httpx
 import numpy as np
@@ -16,6 +16,7 @@ from api_schemas.acquisitions import (
     Acquisition,
     AcquisitionPending,
     ExtendRequest,
+    Mode,
     Purpose,
     ReleaseRequest,
 )
@@ -32,14 +33,16 @@ from api_schemas.rounds import ModelErrorCurve, Round, RoundCreate
 from api_schemas.strategies import Strategy
 from api_schemas.trajectories import SplitChoice, TrajectoriesAdded, Trajectory
 from asim.arrays import Arrays, pack, unpack
-from asim.errors import JobFailed, NotFound, NotReady, RoundFailed
-from asim.transport import Transport
+from asim.errors import JobCancelled, JobFailed, NotFound, NotReady, RoundCancelled, RoundFailed
+from asim.transport import IDEMPOTENCY_KEY, Transport
 
 Item = TypeVar("Item")
 Schema = TypeVar("Schema", bound=BaseModel)
 Id = UUID | str
 POLL_SECONDS = 0.2
 PAGE_SIZE = 1000  # the largest that the service gives
+LONGEST_HOLD = 20.0  # seconds that the service is asked to hold back an answer
+FOLLOW_SECONDS, FOLLOW_PAGE = 1.0, 100  # while events are followed: the last page is asked for again and again
 
 
 class Client:
@@ -50,7 +53,8 @@ class Client:
         key: an API key; embedded mode needs none.
         timeout: seconds without a byte after which a request counts as lost.
         transport: an httpx transport, for tests.
-        retries: how often a GET, or a request that found no connection, is sent again.
+        retries: how often a request is sent again: a GET, `acquire` and `label`, which carry an Idempotency-Key, and
+            whatever found no connection.
 
     Every method raises asim.errors.ServiceError (or its subclass for the status) where the service refuses, and
     asim.errors.Unreachable where no answer comes.
@@ -67,6 +71,7 @@ class Client:
     ) -> None:
         self.base_url = base_url.rstrip("/")
         self._transport = Transport(self.base_url, key, timeout, transport, retries=retries)
+        self._hold = min(LONGEST_HOLD, timeout / 2)  # an answer that is held back must not count as lost
 
     def __enter__(self) -> Self:
         return self
@@ -156,37 +161,32 @@ class Client:
         project: Id,
         count: int,
         *,
+        mode: Mode = "pool",
         strategy: str | None = None,
         purpose: Purpose = "pool",
         lease_seconds: float | None = None,
         labeler: str = "",
         wait: float = 60.0,
+        idempotency_key: str | None = None,
     ) -> Acquisition:
         """POST /acquire, for at most `wait` seconds: where the queue is not ranked yet, its job is awaited.
 
+        idempotency_key: the same key gives the same batch, also where an answer was lost; by default one a call.
+
         Raises:
             NotReady: there was still no ranked queue after `wait` seconds.
-            JobFailed: the job that ranks it failed.
+            JobFailed: the job that ranks it failed, or was cancelled.
         """
         request = AcquireRequest(
             project=UUID(str(project)),
             count=count,
+            mode=mode,
             strategy=strategy,
             purpose=purpose,
             lease_seconds=lease_seconds,
             labeler=labeler,
         )
-        deadline = time.monotonic() + wait
-        while True:
-            answer = self._transport.request("POST", "/acquire", body=request)
-            if answer.status_code != 202:
-                return Acquisition.model_validate_json(answer.content)
-            pending = AcquisitionPending.model_validate_json(answer.content)
-            remaining = deadline - time.monotonic()
-            if remaining <= 0:
-                raise NotReady(f"{pending.detail} (waited {wait:g} s for job {pending.job})")
-            self.wait_for_job(pending.job, timeout=remaining)
-            time.sleep(min(POLL_SECONDS / 4, remaining))  # a job that is done but whose queue is drained must not spin
+        return self._acquired(request, idempotency_key or str(uuid4()), wait)
 
     def acquisition(self, acquisition: Id) -> Acquisition:
         """GET /acquisitions/{id}; its token is not told again."""
@@ -202,9 +202,11 @@ class Client:
         """POST /acquisitions/{id}/release: give back what is not labeled yet."""
         return self._post(f"/acquisitions/{acquisition}/release", ReleaseRequest(token=token), Acquisition)
 
-    def label(self, labels: LabelsRequest) -> LabelsAccepted:
-        """POST /labels: all of them, or none."""
-        return self._post("/labels", labels, LabelsAccepted)
+    def label(self, labels: LabelsRequest, *, idempotency_key: str | None = None) -> LabelsAccepted:
+        """POST /labels: all of them, or none. The same key gives the same receipts; by default one a call."""
+        headers = {IDEMPOTENCY_KEY: idempotency_key or str(uuid4())}
+        answer = self._transport.request("POST", "/labels", body=labels, headers=headers)
+        return LabelsAccepted.model_validate_json(answer.content)
 
     def labels(self, project: Id) -> Iterator[Label]:
         """GET /labels, all pages."""
@@ -230,13 +232,16 @@ class Client:
         timeout: float | None = None,
         progress: Callable[[Round], None] | None = None,
     ) -> Round:
-        """Poll until the round is current or superseded. Raises RoundFailed, or NotReady after `timeout` seconds."""
+        """Poll until the round is current or superseded.
+
+        Raises RoundFailed, also for one that was cancelled, or NotReady after `timeout` seconds.
+        """
 
         def done(seen: Round) -> bool:
             if progress is not None:
                 progress(seen)
-            if seen.status == "failed":
-                raise RoundFailed(seen)
+            if seen.status in ("failed", "cancelled"):
+                raise RoundCancelled(seen) if seen.status == "cancelled" else RoundFailed(seen)
             return seen.status in ("current", "superseded")
 
         return _poll(lambda: self.round(round), done, timeout, f"round {round}")
@@ -268,20 +273,39 @@ class Client:
         return self._pages("/jobs", Job, project=project)
 
     def wait_for_job(self, job: Id, timeout: float | None = None, progress: Callable[[Job], None] | None = None) -> Job:
-        """Poll until the job is done. Raises JobFailed, or NotReady after `timeout` seconds."""
+        """Poll until the job is done.
+
+        Raises JobFailed, also for one that was cancelled, or NotReady after `timeout` seconds.
+        """
 
         def done(seen: Job) -> bool:
             if progress is not None:
                 progress(seen)
-            if seen.state == "failed":
-                raise JobFailed(seen)
-            return seen.state == "done"
+            return _is_done(seen)
 
         return _poll(lambda: self.job(job), done, timeout, f"job {job}")
 
+    def cancel_job(self, job: Id) -> Job:
+        """DELETE /jobs/{id}: it is not run any more. Raises Conflict where it is done or has failed."""
+        return Job.model_validate_json(self._transport.request("DELETE", f"/jobs/{job}").content)
+
     def events(self, project: Id | None = None, cursor: str | None = None) -> Iterator[Event]:
-        """GET /events from `cursor` on, until there are no more for now."""
+        """GET /events from `cursor` on, oldest first, until there are no more for now."""
         return self._pages("/events", Event, project=project, cursor=cursor)
+
+    def follow_events(self, project: Id | None = None) -> Iterator[Event]:
+        """GET /events, oldest first and each once; then those that come, for ever."""
+        cursor, last = None, 0
+        while True:
+            page = self._page("/events", Event, project=project, cursor=cursor, limit=FOLLOW_PAGE)
+            for event in page.items:
+                if event.id > last:
+                    last = event.id
+                    yield event
+            if page.next is None:  # the last page says no cursor: it is read again until it is full
+                time.sleep(FOLLOW_SECONDS)
+            else:
+                cursor = page.next
 
     def strategies(self) -> list[Strategy]:
         """GET /strategies."""
@@ -303,6 +327,28 @@ class Client:
 
     # How they are asked
 
+    def _acquired(self, request: AcquireRequest, key: str, wait: float) -> Acquisition:
+        """Ask under one key until there is a batch: of an answer that is not ready the service keeps nothing.
+
+        The first answer is not held back: it names the job, so that its failure is seen.
+        """
+        deadline, awaited, headers = time.monotonic() + wait, None, {IDEMPOTENCY_KEY: key}
+        while True:
+            left = deadline - time.monotonic()
+            hold = 0 if awaited is None else max(0, int(min(left, self._hold)))
+            preferred = {"Prefer": f"wait={hold}"} if hold else {}
+            answer = self._transport.request("POST", "/acquire", body=request, headers=headers | preferred)
+            if answer.status_code != 202:
+                return Acquisition.model_validate_json(answer.content)
+            pending = AcquisitionPending.model_validate_json(answer.content)
+            if awaited is not None:
+                _is_done(self.job(awaited))
+            if left <= 0:
+                raise NotReady(f"{pending.detail} (waited {wait:g} s for job {pending.job})")
+            if awaited is not None and "Preference-Applied" not in answer.headers:
+                time.sleep(min(POLL_SECONDS, max(0.0, deadline - time.monotonic())))
+            awaited = pending.job
+
     def _get(self, path: str, schema: type[Schema], **params: object) -> Schema:
         return schema.model_validate_json(self._transport.request("GET", path, params=params).content)
 
@@ -313,14 +359,24 @@ class Client:
         return self._transport.request("GET", path, params=params).content
 
     def _pages(self, path: str, schema: type[Schema], **params: object) -> Iterator[Schema]:
-        params["limit"] = PAGE_SIZE
-        page_of = Page[schema]  # type: ignore[valid-type]  # pydantic builds the page's class at run time
         while True:
-            page = page_of.model_validate_json(self._bytes(path, **params))
+            page = self._page(path, schema, limit=PAGE_SIZE, **params)
             yield from page.items
             if page.next is None or not page.items:
                 return
             params["cursor"] = page.next
+
+    def _page(self, path: str, schema: type[Schema], **params: object) -> Page[Schema]:
+        page_of = Page[schema]  # type: ignore[valid-type]  # pydantic builds the page's class at run time
+        page: Page[Schema] = page_of.model_validate_json(self._bytes(path, **params))
+        return page
+
+
+def _is_done(job: Job) -> bool:
+    """Raises JobFailed for a job that will never be."""
+    if job.state in ("failed", "cancelled"):
+        raise JobCancelled(job) if job.state == "cancelled" else JobFailed(job)
+    return job.state == "done"
 
 
 def _poll(ask: Callable[[], Item], done: Callable[[Item], bool], timeout: float | None, what: str) -> Item:

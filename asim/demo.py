@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,17 +53,26 @@ class ArmResult:
     curve: ModelErrorCurve
 
 
-def demo(seed: int, keep: Path | None, plan: DemoPlan | None = None) -> None:
-    """Run both arms against an `asim serve` of its own; print the table and the path of the figure.
+@dataclass(frozen=True)
+class Service:
+    """A service that is there already, and the name that the demo's projects begin with on it."""
+
+    url: str
+    key: str | None = None
+    prefix: str = "demo"
+
+
+def demo(seed: int, keep: Path | None, plan: DemoPlan | None = None, service: Service | None = None) -> None:
+    """Run both arms on `service`, or on an `asim serve` of the demo's own; print the table and the path of the figure.
 
     Raises AsimError where the service dies, a job or a round fails, or the arms did not start from the same labels.
     """
     began = time.monotonic()
-    with Report() as report, _data_folder(keep) as folder:
-        report.tell(f"demo with seed {seed}, data in {folder}")
-        with served(folder, runners=len(STRATEGIES)) as url:
-            report.tell(f"asim serve listens on {url} (dashboard: {url}/dashboard)")
-            results = _run_arms(url, seed, plan or DemoPlan(), report)
+    with Report() as report:
+        report.tell(f"demo with seed {seed}")
+        with _own_service(keep, report) if service is None else nullcontext(service) as found:
+            report.tell(f"the service is {found.url} (dashboard: {found.url}/dashboard)")
+            results = _run_arms(found, seed, plan or DemoPlan(), report)
         if len({result.seeds for result in results.values()}) > 1:
             raise AsimError("the arms drew different seed segments from the same pool: their curves do not compare")
         curves = {strategy: result.curve for strategy, result in results.items()}
@@ -74,12 +83,12 @@ def demo(seed: int, keep: Path | None, plan: DemoPlan | None = None) -> None:
         report.tell(f"the demo took {(time.monotonic() - began) / 60:.1f} minutes")
 
 
-def _run_arms(url: str, seed: int, plan: DemoPlan, report: Report) -> dict[str, ArmResult]:
+def _run_arms(service: Service, seed: int, plan: DemoPlan, report: Report) -> dict[str, ArmResult]:
     """Both arms at once, a thread and a client each. The first failure is raised at once: the caller then stops the
     service, which ends the other arm."""
     pool = ThreadPoolExecutor(len(STRATEGIES))
     futures: dict[str, Future[ArmResult]] = {
-        strategy: pool.submit(_run_arm, url, strategy, seed, plan, report) for strategy in STRATEGIES
+        strategy: pool.submit(_run_arm, service, strategy, seed, plan, report) for strategy in STRATEGIES
     }
     try:
         ended, _ = wait_for(futures.values(), return_when=FIRST_EXCEPTION)
@@ -90,10 +99,10 @@ def _run_arms(url: str, seed: int, plan: DemoPlan, report: Report) -> dict[str, 
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _run_arm(url: str, strategy: StrategyName, seed: int, plan: DemoPlan, report: Report) -> ArmResult:
+def _run_arm(service: Service, strategy: StrategyName, seed: int, plan: DemoPlan, report: Report) -> ArmResult:
     """One project, from nothing to its learning curve."""
-    with Client(url) as client:
-        arm = Arm(client, strategy, seed, plan, report)
+    with Client(service.url, service.key) as client:
+        arm = Arm(client, f"{service.prefix}-{strategy}", strategy, seed, plan, report)
         arm.collect_pool()
         arm.collect_test_set()
         seeds = arm.label_and_train(plan.seed_labels, "random", f"{plan.seed_labels} uniform seed labels")
@@ -108,12 +117,14 @@ def _run_arm(url: str, strategy: StrategyName, seed: int, plan: DemoPlan, report
 class Arm:
     """One project of the demo and what is done with it, over HTTP and the labeling worker alone."""
 
-    def __init__(self, client: Client, strategy: StrategyName, seed: int, plan: DemoPlan, report: Report) -> None:
+    def __init__(
+        self, client: Client, name: str, strategy: StrategyName, seed: int, plan: DemoPlan, report: Report
+    ) -> None:
         self._client, self._seed, self._plan, self._report = client, seed, plan, report
         self._generator = np.random.default_rng(seed)
         policy = LabelingPolicy(strategy=strategy, round_labels=plan.seed_labels)
         self.project = client.create_project(
-            ProjectCreate(name=f"demo-{strategy}", environment=ENVIRONMENT, seed=seed, policy=policy)
+            ProjectCreate(name=name, environment=ENVIRONMENT, seed=seed, policy=policy)
         )
 
     def collect_pool(self) -> None:
@@ -175,6 +186,15 @@ def _verdict(curves: Mapping[str, ModelErrorCurve]) -> str:
     relation = "below" if cycle.model_error.loss < random.model_error.loss else "not below"
     numbers = f"{cycle.model_error.loss:.4f} is {relation} random's {random.model_error.loss:.4f}"
     return f"at {cycle.labels} labels, cycle's test loss {numbers} nats a transition"
+
+
+@contextmanager
+def _own_service(keep: Path | None, report: Report) -> Iterator[Service]:
+    """An `asim serve` for the time of the demo."""
+    with _data_folder(keep) as folder:
+        report.tell(f"data in {folder}")
+        with served(folder, runners=len(STRATEGIES)) as url:
+            yield Service(url)
 
 
 @contextmanager

@@ -36,6 +36,10 @@ class Conflict(ServiceError):
     """409, 410, 412, 423: as things stand it cannot be: another's lease, a different label, a spent budget."""
 
 
+class LeaseLost(Conflict):
+    """410 of a lease: it was given back, or others hold by now what it covered."""
+
+
 class Unavailable(ServiceError):
     """429, 502, 503, 504: not now; try again later."""
 
@@ -51,17 +55,31 @@ class NotReady(AsimError):
 class JobFailed(AsimError):
     """A job ended in failure; `job.error` says why."""
 
-    def __init__(self, job: "Job") -> None:
-        super().__init__(f"job {job.id} ({job.kind}) failed: {job.error or 'no reason was recorded'}")
+    def __init__(self, job: "Job", outcome: str | None = None) -> None:
+        super().__init__(f"job {job.id} ({job.kind}) {outcome or _failed(job.error)}")
         self.job = job
+
+
+class JobCancelled(JobFailed):
+    """Somebody cancelled a job before it was done."""
+
+    def __init__(self, job: "Job") -> None:
+        super().__init__(job, "was cancelled before it was done")
 
 
 class RoundFailed(AsimError):
     """A round ended in failure; `round.error` says why."""
 
-    def __init__(self, failed: "Round") -> None:
-        super().__init__(f"round {failed.number} ({failed.id}) failed: {failed.error or 'no reason was recorded'}")
+    def __init__(self, failed: "Round", outcome: str | None = None) -> None:
+        super().__init__(f"round {failed.number} ({failed.id}) {outcome or _failed(failed.error)}")
         self.round = failed
+
+
+class RoundCancelled(RoundFailed):
+    """Somebody cancelled the job of a round before the round was current."""
+
+    def __init__(self, cancelled: "Round") -> None:
+        super().__init__(cancelled, "was cancelled before it was current")
 
 
 _BY_STATUS: dict[int, type[ServiceError]] = {
@@ -72,10 +90,16 @@ _BY_STATUS: dict[int, type[ServiceError]] = {
     **dict.fromkeys((429, 502, 503, 504), Unavailable),
 }
 
+_BY_TYPE: dict[str, type[ServiceError]] = {"urn:asim:error:lease-lost": LeaseLost}
+
 
 def service_error(problem: "Problem") -> ServiceError:
-    """The exception of `problem`'s status; ServiceError itself for a status that has no class of its own."""
-    return _BY_STATUS.get(problem.status, ServiceError)(problem)
+    """The exception of `problem`'s type, else of its status; ServiceError itself where neither has a class."""
+    return (_BY_TYPE.get(problem.type) or _BY_STATUS.get(problem.status, ServiceError))(problem)
+
+
+def _failed(reason: str | None) -> str:
+    return f"failed: {reason or 'no reason was recorded'}"
 
 
 def _sentence(problem: "Problem") -> str:

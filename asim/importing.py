@@ -1,7 +1,7 @@
 """Recorded trajectories with their actions, from npz files."""
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from uuid import UUID
 
@@ -10,9 +10,11 @@ import numpy as np
 from api_schemas.labels import LabeledTrajectory, LabelsAccepted, LabelSource, LabelsRequest
 from api_schemas.trajectories import SplitChoice
 from asim.arrays import pack, unpack
+from asim.batches import batches
 from asim.client import Client
 from asim.errors import AsimError
 
+BATCH_FILES, BATCH_BYTES = 200, 24 * 2**20  # of one request; in base64, with actions, well below the service's limit
 ACTIONS = "actions.npy"  # the member of an npz file that holds an array named actions
 
 
@@ -25,11 +27,15 @@ def has_actions(path: Path) -> bool:
         raise AsimError(f"{path}: not an npz file ({error})") from error
 
 
-def add_labeled(client: Client, project: UUID, paths: Sequence[Path], split: SplitChoice) -> LabelsAccepted:
-    """Post the files as labeled trajectories, all or none."""
-    trajectories = [_labeled_trajectory(path, split) for path in paths]
+def add_labeled(
+    client: Client, project: UUID, paths: Sequence[Path], split: SplitChoice
+) -> Iterator[tuple[int, LabelsAccepted]]:
+    """Post the files as labeled trajectories, a batch after the other; how many it held, and what became of it."""
+    read = (_labeled_trajectory(path, split) for path in paths)
     source = LabelSource(kind="import", name="asim import")
-    return client.label(LabelsRequest(project=project, source=source, trajectories=trajectories))
+    for batch in batches(read, lambda one: len(one.content), BATCH_FILES, BATCH_BYTES):
+        accepted = client.label(LabelsRequest(project=project, source=source, trajectories=batch))
+        yield len(batch), accepted
 
 
 def _labeled_trajectory(path: Path, split: SplitChoice) -> LabeledTrajectory:

@@ -23,7 +23,10 @@ def given(client: Client, project: Project, acquisition: str, token: int | None)
 def answer(client: Client, batch: Acquisition, seed: int, report: Report) -> None:
     """Label the batch with the project's simulator, telling what became of it. Raises AsimError where it cannot."""
     generator = np.random.default_rng(seed)
-    with report.step(f"label {len(batch.items)} segments ranked by {batch.strategy}") as advance:
+    if batch.reason is not None:
+        report.tell(f"a smaller batch: {batch.reason}")
+    what = "explore from {} states drawn by {}" if batch.mode == "explore" else "label {} segments ranked by {}"
+    with report.step(what.format(len(batch.items), batch.strategy)) as advance:
         try:
             accepted = run_labeling(client, batch, generator, lambda done, all_: advance(done / all_, ""))
         except UnexplainedStep as error:

@@ -1,21 +1,27 @@
 """The service's answers as tables for a terminal."""
 
+import json
 from collections.abc import Mapping, Sequence
+from datetime import UTC
 
 from rich.console import Console
 from rich.table import Table
 
 from api_schemas.acquisitions import Acquisition
+from api_schemas.events import Event
+from api_schemas.jobs import Job
 from api_schemas.projects import Project
 from api_schemas.rounds import ModelError, ModelErrorCurve
 
 WIDTH_WITHOUT_TERMINAL = 200
+TEXT = ("id", "trajectory", "environment", "strategy", "actions", "kind", "state", "message", "error")
 
 
 def show(table: Table) -> None:
     """Print it; without a terminal, wide enough for a log."""
     console = Console()
-    (console if console.is_terminal else Console(width=WIDTH_WITHOUT_TERMINAL)).print(table)
+    wide = console if console.is_terminal else Console(width=WIDTH_WITHOUT_TERMINAL)
+    wide.print(table, markup=False)  # what users typed may hold brackets
 
 
 def project_table(projects: Sequence[Project]) -> Table:
@@ -31,12 +37,30 @@ def project_table(projects: Sequence[Project]) -> Table:
 
 
 def acquisition_table(acquisition: Acquisition) -> Table:
-    """One row a segment, best first."""
-    table = _table("rank", "trajectory", "start", "length", "score")
+    """One row a segment, best first; of an exploration, the actions to execute instead of a score."""
+    explores = acquisition.mode == "explore"
+    table = _table("rank", "trajectory", "start", "length", "actions" if explores else "score")
     for item in acquisition.items:
         score = "" if item.score is None else f"{item.score:.4f}"
-        table.add_row(str(item.rank), item.trajectory, str(item.start), str(item.length), score)
+        last = json.dumps(item.actions) if explores else score
+        table.add_row(str(item.rank), item.trajectory, str(item.start), str(item.length), last)
     return table
+
+
+def job_table(jobs: Sequence[Job]) -> Table:
+    """One row a job."""
+    table = _table("job", "kind", "state", "attempts", "progress", "message", "error")
+    for job in jobs:
+        attempts = f"{job.attempts} of {job.max_attempts}"
+        table.add_row(str(job.id), job.kind, job.state, attempts, f"{job.progress:.0%}", job.message, job.error or "")
+    return table
+
+
+def event_line(event: Event) -> str:
+    """Time, who, what, and what there is to know about it, on one line."""
+    moment = event.created_at.astimezone(UTC)
+    line = f"{moment:%Y-%m-%d %H:%M:%S}Z {event.actor or '-'} {event.kind} {json.dumps(event.data, ensure_ascii=False)}"
+    return "".join(each if each.isprintable() else f"\\u{ord(each):04x}" for each in line)
 
 
 def error_table(curves: Mapping[str, ModelErrorCurve], first_column: str = "project") -> Table:
@@ -63,7 +87,7 @@ def _table(first: str, *others: str) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column(first, overflow="fold")
     for name in others:
-        text = name in ("id", "trajectory", "environment", "strategy")
+        text = name in TEXT
         table.add_column(
             name, justify="left" if text else "right", overflow="fold", no_wrap=name in ("id", "trajectory")
         )

@@ -12,6 +12,7 @@ from asim.errors import ServiceError, Unreachable, service_error
 
 RETRIED_STATUSES = frozenset({429, 502, 503, 504})
 LONGEST_PAUSE = 10.0  # seconds
+IDEMPOTENCY_KEY = "Idempotency-Key"  # what is sent again under the same one is done once
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 Params = Mapping[str, object]
 Upload = tuple[str, tuple[str, bytes, str]]
@@ -20,8 +21,9 @@ Upload = tuple[str, tuple[str, bytes, str]]
 class Transport:
     """Sends requests to one service.
 
-    A GET is repeated after a broken connection or a "not now" (429, 502, 503, 504), waiting as long as Retry-After
-    says. Any other method is repeated only where no connection was made, so that nothing is ever done twice.
+    A GET, or a request with an Idempotency-Key, is repeated after a broken connection or a "not now" (429, 502, 503,
+    504), waiting as long as Retry-After says. Any other request is repeated only where no connection was made, so that
+    nothing is ever done twice.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class Transport:
         params: Params | None = None,
         body: BaseModel | None = None,
         files: list[Upload] | None = None,
+        headers: Mapping[str, str] | None = None,
         accept: Collection[int] = (),
     ) -> httpx.Response:
         """The answer to one request; statuses in `accept` are answers too, other 4xx and 5xx raise.
@@ -64,12 +67,13 @@ class Transport:
             Unreachable: no answer came.
         """
         request = self._build(method, path, params, body, files)
+        request.headers.update(headers or {})
         attempt = 0
         while True:
             outcome = self._attempt(request)
             if isinstance(outcome, httpx.Response) and (outcome.is_success or outcome.status_code in accept):
                 return outcome
-            if attempt >= self._retries or not _may_repeat(method, outcome):
+            if attempt >= self._retries or not _may_repeat(request, outcome):
                 raise _failure(outcome, request)
             self._sleep(self._pause(attempt, outcome))
             attempt += 1
@@ -97,10 +101,10 @@ class Transport:
         return min(base, LONGEST_PAUSE) * self._random.uniform(1.0, 1.25)
 
 
-def _may_repeat(method: str, outcome: httpx.Response | httpx.TransportError) -> bool:
+def _may_repeat(request: httpx.Request, outcome: httpx.Response | httpx.TransportError) -> bool:
     if isinstance(outcome, httpx.ConnectError | httpx.ConnectTimeout):
         return True
-    if method != "GET":
+    if request.method != "GET" and IDEMPOTENCY_KEY not in request.headers:
         return False
     return isinstance(outcome, httpx.TransportError) or outcome.status_code in RETRIED_STATUSES
 

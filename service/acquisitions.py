@@ -1,45 +1,37 @@
-"""Acquisitions: batches of segments given out under a lease, from a ranked queue that a scoring job made."""
+"""Acquisitions: batches given out under a lease: segments of a ranked queue, held-out segments, or explorations."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from uuid import UUID
 
-import numpy as np
 from sqlalchemy.orm import Session
 
 from api_schemas.acquisitions import AcquireRequest, Acquisition, AcquisitionItem
 from api_schemas.strategies import STRATEGY_NAMES
-from service import events, projects, scorings
-from service.errors import (
-    BudgetExhausted,
-    InvalidLeaseToken,
-    LeaseLost,
-    PoolExhausted,
-    UnknownResource,
-    UnknownStrategy,
-)
+from service import draws, events, leases, projects, scorings
+from service.draws import Candidate
+from service.errors import BudgetExhausted, PoolExhausted, UnknownStrategy
 from service.store.queries import acquisitions as queries
-from service.store.queries import pool as pool_queries
-from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, JobRow, ProjectRow
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A segment about to be given out."""
-
-    trajectory: str
-    start: int
-    score: float | None
+from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, JobRow, ProjectRow, QueueRow
 
 
 @dataclass(frozen=True)
 class Draw:
-    """What a batch is made of, and who ranked it."""
+    """What a batch is made of, who ranked it, and why it is smaller than was asked for."""
 
     strategy: str
-    round_id: UUID | None
     candidates: Sequence[Candidate]
+    round_id: UUID | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class Room:
+    """How many items can be given out, and what stands in the way of more."""
+
+    count: int
+    reason: str | None = field(default=None)
 
 
 def acquire(
@@ -47,75 +39,38 @@ def acquire(
 ) -> AcquisitionRow | JobRow:
     """The next batch, or the job to wait for where no ranked queue is ready.
 
+    Whoever asks at the same time reads other rows of the queue (SKIP LOCKED); under the project's lock, which all take
+    one after the other for the short rest, nothing is given out that another has taken meanwhile.
     Raises UnknownResource, UnknownStrategy, PoolExhausted, BudgetExhausted.
     """
+    project = projects.find(session, request.project)
+    requested = _known(request.strategy or projects.policy_of(project).strategy)
+    ranked = request.purpose == "pool" and request.mode == "pool"
+    first = _front_of_queue(session, project, requested, request.count, now) if ranked else None
     project = projects.find(session, request.project, lock=True)
-    policy = projects.policy_of(project)
-    requested = _known(request.strategy or policy.strategy)
-    _check_counts(session, project, request, now)
-    if request.purpose == "held_out":
-        drawn: Draw | JobRow = Draw("random", None, _draw_held_out(session, project, request.count, now))
+    room = _room(session, project, request, now)
+    if request.mode == "explore":
+        drawn: Draw | JobRow = _draw_explorations(session, project, room)
+    elif request.purpose == "held_out":
+        drawn = Draw("random", draws.held_out(session, project, room.count, now), reason=room.reason)
     else:
-        drawn = _draw_ranked(session, project, requested, request.count, now, limits)
+        drawn = _draw_ranked(session, project, requested, room, first, now, limits)
     if isinstance(drawn, JobRow):
         return drawn
     return _lease(session, project, request, requested, drawn, now)
 
 
-def extend(session: Session, acquisition_id: UUID, token: int, seconds: float | None, now: datetime) -> AcquisitionRow:
-    """Move the lease's end. What another has claimed meanwhile stays theirs. Raises InvalidLeaseToken, LeaseLost."""
-    row = _held(session, acquisition_id, token)
-    if not queries.claims_of(session, row.id, token):
-        raise LeaseLost(row.id, "its segments are labeled or held by others by now")
-    row.lease_expires_at = now + timedelta(seconds=seconds or _lease_seconds(session, row))
-    queries.extend_claims(session, row.id, token, row.lease_expires_at)
-    events.record(session, row.project_id, "lease.extended", {"acquisition": str(row.id)}, now)
-    return row
-
-
-def release(session: Session, acquisition_id: UUID, token: int, now: datetime) -> AcquisitionRow:
-    """Give the unlabeled segments back to the pool. Raises InvalidLeaseToken, LeaseLost."""
-    row = _held(session, acquisition_id, token)
-    for claim in queries.claims_of(session, row.id, token):
-        session.delete(claim)
-    row.status = "released"
-    events.record(session, row.project_id, "lease.released", {"acquisition": str(row.id)}, now)
-    return row
-
-
-def find(session: Session, acquisition_id: UUID) -> AcquisitionRow:
-    """The acquisition's row. Raises UnknownResource."""
-    row = session.get(AcquisitionRow, acquisition_id)
-    if row is None:
-        raise UnknownResource("acquisition", acquisition_id)
-    return row
-
-
-def close_if_labeled(session: Session, row: AcquisitionRow, now: datetime) -> None:
-    """An acquisition whose items are all labeled is labeled."""
-    if row.status == "leased" and all(label for _, label in queries.items_with_labels(session, row.id)):
-        row.status = "labeled"
-        events.record(session, row.project_id, "acquisition.labeled", {"acquisition": str(row.id)}, now)
-
-
 def describe(session: Session, row: AcquisitionRow, now: datetime, *, with_token: bool) -> Acquisition:
     """The acquisition as the API shows it; the token only to the one who has just acquired it."""
     project = projects.find(session, row.project_id)
-    items = [
-        AcquisitionItem(
-            rank=item.rank,
-            trajectory=item.trajectory_id,
-            start=item.start,
-            length=project.segment_length,
-            score=item.score,
-            labeled=label is not None,
-        )
-        for item, label in queries.items_with_labels(session, row.id)
-    ]
+    items = [_shown(project, item, label) for item, label in queries.items_with_labels(session, row.id)]
     expired = row.status == "leased" and row.lease_expires_at <= now
     fields = {
         name: getattr(row, name)
-        for name in ("id", "purpose", "strategy", "requested_strategy", "labeler", "lease_expires_at", "created_at")
+        for name in (
+            *("id", "mode", "purpose", "strategy", "requested_strategy", "reason", "labeler"),
+            *("lease_expires_at", "created_at"),
+        )
     }
     return Acquisition(
         project=project.id,
@@ -123,7 +78,7 @@ def describe(session: Session, row: AcquisitionRow, now: datetime, *, with_token
         status="expired" if expired else row.status,  # type: ignore[arg-type]  # pydantic checks the literal
         token=row.token if with_token else None,
         items=items,
-        budget=projects.budget_of(project, pool_queries.split_count(session, project.id, "pool", now)),
+        budget=projects.budget_of(session, project, now),
         **fields,
     )
 
@@ -134,41 +89,64 @@ def _known(strategy: str) -> str:
     return strategy
 
 
-def _check_counts(session: Session, project: ProjectRow, request: AcquireRequest, now: datetime) -> None:
-    split = pool_queries.split_count(session, project.id, request.purpose, now)
-    if request.count > split.free:
-        raise PoolExhausted(request.count, split.free, request.purpose)
-    budget = projects.budget_of(project, split)
+def _front_of_queue(
+    session: Session, project: ProjectRow, strategy: str, count: int, now: datetime
+) -> tuple[UUID, Sequence[QueueRow]] | None:
+    """The first free rows of the queue that nobody else reads at this moment, where a queue is ready."""
+    scoring = scorings.ready(session, project, strategy)
+    return None if scoring is None else (scoring.id, queries.free_queue(session, scoring, count, now, lock=True))
+
+
+def _room(session: Session, project: ProjectRow, request: AcquireRequest, now: datetime) -> Room:
+    """What of the asked count budget and split allow; call it under the project's lock."""
+    room = Room(request.count)
+    if request.mode == "pool":
+        free = projects.split_count(session, project, request.purpose, now).free
+        if free < 1:
+            raise PoolExhausted(request.count, 0, request.purpose)
+        if free < room.count:
+            room = Room(free, f"{request.count} were asked for, {free} are left in the {request.purpose} split")
+    budget = projects.budget_of(session, project, now)
     if request.purpose == "held_out" or budget.total is None or budget.remaining is None:
-        return
-    if request.count > budget.remaining:
+        return room
+    if budget.remaining < 1:
         raise BudgetExhausted(request.count, budget.remaining, budget.total)
+    if budget.remaining < room.count:
+        reason = f"{request.count} were asked for, {budget.remaining} of the budget of {budget.total} labels remain"
+        room = Room(budget.remaining, reason)
+    return room
 
 
 def _draw_ranked(
-    session: Session, project: ProjectRow, requested: str, count: int, now: datetime, limits: scorings.Limits
+    session: Session,
+    project: ProjectRow,
+    requested: str,
+    room: Room,
+    first: tuple[UUID, Sequence[QueueRow]] | None,
+    now: datetime,
+    limits: scorings.Limits,
 ) -> Draw | JobRow:
     scoring = scorings.usable(session, project, requested, now, limits)
     if isinstance(scoring, JobRow):
         return scoring
-    free = queries.free_queue(session, scoring, count, now)
-    if len(free) < count:
-        return scorings.refill(session, project, scoring, count, now, limits)
-    candidates = [Candidate(row.trajectory_id, row.start, row.score) for row in free]
-    return Draw(scoring.strategy, scoring.round_id, candidates)
+    rows: Sequence[QueueRow] = []
+    if first is not None and first[0] == scoring.id:
+        taken = queries.taken_among(session, project.id, [(row.trajectory_id, row.start) for row in first[1]], now)
+        rows = [row for row in first[1] if (row.trajectory_id, row.start) not in taken][: room.count]
+    if len(rows) < room.count:  # others were faster, or the queue is short: look again, now that nobody moves
+        rows = queries.free_queue(session, scoring, room.count, now)
+    if len(rows) < room.count:
+        return scorings.refill(session, project, scoring, room.count, now, limits)
+    candidates = [Candidate(row.trajectory_id, row.start, row.score) for row in rows]
+    return Draw(scoring.strategy, candidates, scoring.round_id, room.reason)
 
 
-def _draw_held_out(session: Session, project: ProjectRow, count: int, now: datetime) -> list[Candidate]:
-    """Uniform over the free held-out segments; the generator is seeded by the project and the lease's token."""
-    taken = pool_queries.taken_starts(session, project.id, "held_out", now)
-    free = [
-        (member.trajectory_id, start)
-        for member in pool_queries.memberships(session, project.id, "held_out")
-        for start in range(0, member.segments * project.stride, project.stride)
-        if start not in taken.get(member.trajectory_id, ())
-    ]
-    chosen = np.random.default_rng([project.seed, project.token]).choice(len(free), count, replace=False)
-    return [Candidate(free[i][0], free[i][1], None) for i in chosen]
+def _draw_explorations(session: Session, project: ProjectRow, room: Room) -> Draw:
+    """States of the pool and actions to execute there, both drawn uniformly: no model proposes any yet."""
+    candidates = draws.explorations(session, project, room.count)
+    if not candidates:
+        raise PoolExhausted(room.count, 0, "pool")
+    return Draw("random", candidates, reason=room.reason)
 
 
 def _lease(
@@ -178,11 +156,13 @@ def _lease(
     seconds = request.lease_seconds or projects.policy_of(project).lease_seconds
     row = AcquisitionRow(
         project_id=project.id,
+        mode=request.mode,
         purpose=request.purpose,
         strategy=draw.strategy,
         requested_strategy=requested,
         round_id=draw.round_id,
         status="leased",
+        reason=draw.reason,
         labeler=request.labeler,
         token=project.token,
         lease_expires_at=now + timedelta(seconds=seconds),
@@ -191,9 +171,9 @@ def _lease(
     session.add(row)
     session.flush()
     session.add_all([_item(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
-    queries.take_claims(session, [_claim(row, candidate) for candidate in draw.candidates])
-    data = {"acquisition": str(row.id), "count": request.count, "strategy": row.strategy, "labeler": row.labeler}
-    events.record(session, project.id, "lease.given", data, now)
+    queries.take_claims(session, [_claim(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
+    data = {"acquisition": str(row.id), "count": len(draw.candidates), "strategy": row.strategy}
+    events.record(session, project.id, "lease.given", data | {"labeler": row.labeler, "mode": row.mode}, now)
     session.flush()
     return row
 
@@ -205,30 +185,33 @@ def _item(row: AcquisitionRow, rank: int, candidate: Candidate) -> AcquisitionIt
         trajectory_id=candidate.trajectory,
         start=candidate.start,
         score=candidate.score,
+        actions=None if candidate.actions is None else list(candidate.actions),
     )
 
 
-def _claim(row: AcquisitionRow, candidate: Candidate) -> ClaimRow:
+def _claim(row: AcquisitionRow, rank: int, candidate: Candidate) -> ClaimRow:
+    explores = row.mode == "explore"
     return ClaimRow(
         project_id=row.project_id,
-        trajectory_id=candidate.trajectory,
-        start=candidate.start,
+        trajectory_id=leases.exploration_name(row.id) if explores else candidate.trajectory,
+        start=rank if explores else candidate.start,
         acquisition_id=row.id,
-        purpose=row.purpose,
+        purpose="explore" if explores else row.purpose,
         token=row.token,
         expires_at=row.lease_expires_at,
     )
 
 
-def _held(session: Session, acquisition_id: UUID, token: int) -> AcquisitionRow:
-    row = find(session, acquisition_id)
-    projects.find(session, row.project_id, lock=True)
-    if token != row.token:
-        raise InvalidLeaseToken(row.id, token)
-    if row.status != "leased":
-        raise LeaseLost(row.id, f"it is {row.status}")
-    return row
-
-
-def _lease_seconds(session: Session, row: AcquisitionRow) -> float:
-    return projects.policy_of(projects.find(session, row.project_id)).lease_seconds
+def _shown(project: ProjectRow, item: AcquisitionItemRow, label: UUID | None) -> AcquisitionItem:
+    explores = item.actions is not None
+    return AcquisitionItem.model_validate(
+        {
+            "rank": item.rank,
+            "trajectory": item.trajectory_id,
+            "start": item.start,
+            "length": project.segment_length,
+            "score": item.score,
+            "labeled": item.answer is not None if explores else label is not None,
+            "actions": item.actions,
+        }
+    )

@@ -7,24 +7,30 @@ not been sent. A message that is lost is sent again, one that arrives twice find
 import threading
 from collections.abc import Callable
 from datetime import datetime, timedelta
+from uuid import UUID
 
 from celery import Celery
+from kombu.exceptions import OperationalError as BrokerError
 
 from api_schemas.jobs import RUN_JOB
-from service import reaper
+from service import canary, reaper
 from service.log import get_logger
 from service.settings import Settings
 from service.store.database import Database
 from service.store.queries import jobs as queries
 
 log = get_logger("carrier")
-RESEND_AFTER = timedelta(seconds=60)
 BATCH = 100
+PAUSE_SECONDS = 1.0  # after a broker or a database has failed
+CONNECT_SECONDS = 2.0
+ANSWER_SECONDS = 5.0
+RETURN_SECONDS = 10.0  # between two looks for messages whose visibility has ended
+PATIENCE = {"max_retries": 1, "interval_start": 0.0, "interval_step": 0.2, "interval_max": 0.2}
 
 
-def celery_app(settings: Settings) -> Celery:
+def celery_app(settings: Settings, *, current: bool = True) -> Celery:
     """A Celery app with the settings that both ends share; only workers.app adds tasks to it."""
-    app = Celery("asim", broker=settings.broker_url)
+    app = Celery("asim", broker=settings.broker_url, set_as_current=current)
     app.conf.update(
         task_ignore_result=True,  # the database is the truth
         task_acks_late=True,
@@ -39,20 +45,74 @@ def celery_app(settings: Settings) -> Celery:
         worker_hijack_root_logger=False,
         worker_cancel_long_running_tasks_on_connection_loss=True,
         broker_connection_retry_on_startup=True,
-        broker_transport_options={"visibility_timeout": 900, "global_keyprefix": f"{settings.celery_prefix}:"},
+        broker_connection_max_retries=None,  # a worker outlives a broker that is away for long
+        broker_transport_options=_transport_options(settings),
+        # No worker_max_memory_per_child: it looks only after a job has ended, so it does not keep a job from using up
+        # the memory, and each new child loads torch again. What the kernel kills costs its job an attempt.
     )
     return app
 
 
-def relay(database: Database, app: Celery, prefix: str, now: datetime) -> int:
-    """Send every job that may run and was not sent, or was sent long ago and never claimed; returns how many."""
+def impatient_app(settings: Settings) -> Celery:
+    """An app that gives up soon on a broker that is away: who uses it comes again, and has other things to do."""
+    app = celery_app(settings, current=False)
+    bounds = {"socket_connect_timeout": CONNECT_SECONDS, "socket_timeout": ANSWER_SECONDS}
+    shared = app.conf.broker_transport_options
+    app.conf.update(
+        broker_connection_timeout=CONNECT_SECONDS,
+        broker_transport_options={**shared, **PATIENCE, **(bounds if settings.redis_broker else {})},
+    )
+    return app
+
+
+def messages_in(app: Celery, queue: str) -> int:
+    """How many messages the broker holds in a queue for whoever asks next. Raises BrokerError."""
+    with app.connection_for_write() as connection:
+        # Passive, so that RabbitMQ makes no queue of it. On Redis declaring makes none, and kombu's passive declaration
+        # looks for the key without global_keyprefix, that is never finds it.
+        passive = connection.transport.driver_type != "redis"
+        try:
+            return int(connection.default_channel.queue_declare(queue=queue, passive=passive).message_count)
+        except connection.channel_errors:  # there is no such queue; Redis forgets a queue when it is empty
+            return 0
+        except connection.connection_errors as error:
+            raise BrokerError(f"queue {queue}: {error}") from error
+
+
+def relay(database: Database, app: Celery, settings: Settings, now: datetime) -> int:
+    """Send every job that may run and was not sent, or whose message is lost; returns how many."""
     with database.read() as session:
-        waiting = [(row.id, row.queue) for row in queries.unsent(session, now, now - RESEND_AFTER, BATCH)]
+        waiting = [(row.id, row.queue) for row in queries.unsent(session, now, BATCH)]
+    waiting += _lost(database, app, settings, now)
     for job_id, queue in waiting:  # outside any transaction: a broker may take its time
-        app.send_task(RUN_JOB, [str(job_id)], queue=f"{prefix}.{queue}")
+        name = f"{settings.celery_prefix}.{queue}"
+        app.send_task(RUN_JOB, [str(job_id)], queue=name, retry=True, retry_policy=PATIENCE)
         with database.write() as session:
             queries.mark_sent(session, job_id, now)
     return len(waiting)
+
+
+def _lost(database: Database, app: Celery, settings: Settings, now: datetime) -> list[tuple[UUID, str]]:
+    """Jobs that nobody claimed since they were sent, where the broker holds no message that could still arrive."""
+    with database.read() as session:
+        sent_before = now - timedelta(seconds=settings.resend_seconds)
+        unclaimed = [(row.id, row.queue) for row in queries.unclaimed(session, now, sent_before, BATCH)]
+    queues, prefix = {queue for _, queue in unclaimed}, settings.celery_prefix
+    empty = {queue for queue in queues if messages_in(app, f"{prefix}.{queue}") == 0}
+    return [(job_id, queue) for job_id, queue in unclaimed if queue in empty]
+
+
+def _transport_options(settings: Settings) -> dict[str, object]:
+    """What only the Redis transport knows; RabbitMQ returns the messages of a lost worker by itself, at once."""
+    if not settings.redis_broker:
+        return {}
+    return {
+        "global_keyprefix": f"{settings.celery_prefix}:",
+        "visibility_timeout": settings.visibility_seconds,
+        # By default every tenth look does something, and a message returns up to 100 s late.
+        "unacked_restore_interval": min(RETURN_SECONDS, settings.visibility_seconds),
+        "unacked_restore_throttle": 1,
+    }
 
 
 class Relay:
@@ -73,12 +133,19 @@ class Relay:
         self._thread.join(timeout=10)
 
     def _run(self) -> None:
-        app = celery_app(self._settings)
+        app = impatient_app(self._settings)
         while not self._stop.wait(self._settings.poll_seconds):
             try:
-                with self._database.write() as session:
-                    reaper.reap(session, self._clock())
-                relay(self._database, app, self._settings.celery_prefix, self._clock())
+                self._reap()
+                relay(self._database, app, self._settings, self._clock())
+            except BrokerError as error:  # without its traceback: there may be one a second for an hour
+                log.warning("broker_unreachable", error=str(error))
+                self._stop.wait(PAUSE_SECONDS)
             except Exception as error:  # the thread's boundary: without it one bad moment would end all sending
                 log.exception("relay_failed", error=str(error))
-                self._stop.wait(1.0)
+                self._stop.wait(PAUSE_SECONDS)
+
+    def _reap(self) -> None:
+        with self._database.write() as session:
+            reaper.reap(session, self._clock())
+            canary.plant(session, self._clock(), self._settings.canary_seconds / 4)

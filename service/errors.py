@@ -102,7 +102,7 @@ class NameTaken(ServiceError):
 
 
 class PoolExhausted(ServiceError):
-    """The pool has fewer segments than were asked for."""
+    """The pool has no segment left to give."""
 
     status_code = 409
 
@@ -113,12 +113,24 @@ class PoolExhausted(ServiceError):
 
 
 class BudgetExhausted(ServiceError):
-    """The project's label budget does not cover the batch."""
+    """The project's label budget does not cover this."""
 
     status_code = 409
 
     def __init__(self, asked: int, remaining: int, total: int) -> None:
         super().__init__(f"count: asked for {asked} segments, {remaining} of the budget of {total} labels remain")
+
+
+class IdempotencyKeyReused(ServiceError):
+    """An Idempotency-Key stands for one request."""
+
+    status_code = 422
+
+    def __init__(self, key: str, route: str) -> None:
+        reason = f"was used for another body of {route}"
+        super().__init__(
+            f"Idempotency-Key: {key!r} {reason}", [InvalidParam(name="Idempotency-Key", reason=reason, value=key)]
+        )
 
 
 class InvalidLeaseToken(ServiceError):
@@ -225,6 +237,15 @@ class BodyTooLarge(ServiceError):
     """The request is larger than this service takes."""
 
     status_code = 413
+
+
+class JobFinished(ServiceError):
+    """A job that has ended cannot be cancelled."""
+
+    status_code = 409
+
+    def __init__(self, job: UUID, state: str) -> None:
+        super().__init__(f"job {job} is {state}; there is nothing left to cancel")
 
 
 class JobLost(ServiceError):

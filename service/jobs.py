@@ -7,14 +7,14 @@ lease ends, the job is queued again, and whatever the old holder writes afterwar
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from uuid import UUID
+from uuid import UUID, uuid4
 
 from pydantic import TypeAdapter
 from sqlalchemy.orm import Session
 
-from api_schemas.jobs import PRIORITIES, QUEUES, Job, JobPayload
-from service import events
-from service.errors import JobLost, UnknownResource
+from api_schemas.jobs import PRIORITIES, QUEUES, Canary, Job, JobPayload
+from service import events, origin
+from service.errors import JobFinished, JobLost, UnknownResource
 from service.store.queries import jobs as queries
 from service.store.tables import JobRow, WorkerRow
 
@@ -33,23 +33,32 @@ class Lease:
 
 
 def enqueue(
-    session: Session, project_id: UUID, payload: JobPayload, subject_id: UUID, now: datetime, max_attempts: int = 5
+    session: Session,
+    project_id: UUID | None,
+    payload: JobPayload,
+    subject_id: UUID,
+    now: datetime,
+    max_attempts: int = 3,
+    job_id: UUID | None = None,
 ) -> JobRow:
     """A queued job, in the caller's transaction: it exists if and only if the caller's other writes do."""
     row = JobRow(
+        id=job_id or uuid4(),
         project_id=project_id,
         kind=payload.kind,
-        queue=QUEUES[payload.kind],
+        queue=payload.queue if isinstance(payload, Canary) else QUEUES[payload.kind],
         priority=PRIORITIES.get(payload.kind, 0),
         payload=payload.model_dump(mode="json"),
         subject_id=subject_id,
         state="queued",
         max_attempts=max_attempts,
+        correlation=origin.current().correlation,
         result={},
         created_at=now,
     )
     session.add(row)
     session.flush()
+    _tell(session, row, "queued", now)
     return row
 
 
@@ -61,17 +70,21 @@ def payload_of(row: JobRow) -> JobPayload:
 def claim_next(session: Session, queues: Sequence[str], owner: str, now: datetime, lease: float) -> JobRow | None:
     """Claim the next waiting job of these queues, for `lease` seconds."""
     row = queries.next_job(session, queues, now)
-    return None if row is None else _claim(row, owner, now, lease)
+    return None if row is None else _claim(session, row, owner, now, lease)
 
 
 def claim(session: Session, job_id: UUID, owner: str, now: datetime, lease: float) -> JobRow | None:
-    """Claim this job; None where it is done, held by another or unknown, so a message may arrive twice."""
+    """Claim this job; None where it has ended, is held by another or unknown, so a message may arrive twice.
+
+    One that a silent worker held is claimed too, unless that was its last attempt: it is the reaper's to fail.
+    """
     row = queries.locked_job(session, job_id)
-    if row is None or row.state in ("done", "failed"):
+    if row is None or row.state not in ("queued", "running"):
         return None
-    if row.state == "running" and row.lease_until is not None and row.lease_until > now:
+    held_now = row.lease_until is not None and row.lease_until > now
+    if row.state == "running" and (held_now or row.attempts >= row.max_attempts):
         return None
-    return _claim(row, owner, now, lease)
+    return _claim(session, row, owner, now, lease)
 
 
 def lease_of(row: JobRow) -> Lease:
@@ -106,7 +119,7 @@ def complete(session: Session, lease: Lease, result: dict[str, object], now: dat
     row = held(session, lease)
     row.state, row.progress, row.result, row.finished_at = "done", 1.0, result, now
     row.owner = row.lease_until = None
-    events.record(session, row.project_id, "job.done", {"job": str(row.id), "kind": row.kind}, now)
+    _tell(session, row, "done", now)
     return row
 
 
@@ -123,6 +136,21 @@ def give_back(session: Session, lease: Lease, now: datetime) -> None:
     row.state, row.owner, row.lease_until, row.sent_at = "queued", None, None, None
     row.attempts -= 1
     row.heartbeat_at = now
+    _tell(session, row, "gave_way", now)
+
+
+def cancel(session: Session, job_id: UUID, now: datetime) -> JobRow:
+    """Nobody is to run the job any more; whoever holds it has lost it. Raises UnknownResource, JobFinished."""
+    row = queries.locked_job(session, job_id)
+    if row is None:
+        raise UnknownResource("job", job_id)
+    if row.state in ("done", "failed"):
+        raise JobFinished(job_id, row.state)
+    if row.state != "cancelled":
+        row.state, row.owner, row.lease_until, row.finished_at = "cancelled", None, None, now
+        row.fence += 1
+        _tell(session, row, "cancelled", now)
+    return row
 
 
 def reap(session: Session, now: datetime) -> list[JobRow]:
@@ -155,12 +183,13 @@ def describe(row: JobRow) -> Job:
     return Job(project=row.project_id, **fields)
 
 
-def _claim(row: JobRow, owner: str, now: datetime, lease: float) -> JobRow:
+def _claim(session: Session, row: JobRow, owner: str, now: datetime, lease: float) -> JobRow:
     row.state, row.owner = "running", owner
     row.fence += 1
     row.attempts += 1
     row.heartbeat_at, row.lease_until = now, now + timedelta(seconds=lease)
     row.started_at = row.started_at or now
+    _tell(session, row, "started", now, attempt=row.attempts)
     return row
 
 
@@ -174,5 +203,13 @@ def _end_attempt(session: Session, row: JobRow, error: str, now: datetime, *, re
         row.not_before = now + timedelta(seconds=pause)
     else:
         row.finished_at = now
-    kind = "job.retried" if again else "job.failed"
-    events.record(session, row.project_id, kind, {"job": str(row.id), "kind": row.kind, "error": error}, now)
+    _tell(session, row, "retried" if again else "failed", now, error=error)
+
+
+def _tell(session: Session, row: JobRow, what: str, now: datetime, **more: object) -> None:
+    """Record the change. Where no request is at hand it goes back to the one that asked for the job."""
+    if row.project_id is None:
+        return
+    data = {"job": str(row.id), "kind": row.kind, **more}
+    with origin.bound(correlation=origin.current().correlation or row.correlation):
+        events.record(session, row.project_id, f"job.{what}", data, now)

@@ -3,11 +3,13 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
+from uuid import uuid4
 
 from sqlalchemy.orm import Session
 
+from api_schemas.environments import Spaces
 from api_schemas.labels import (
     Action,
     Label,
@@ -18,10 +20,9 @@ from api_schemas.labels import (
     LabelsRequest,
 )
 from api_schemas.trajectories import SplitChoice
-from service import acquisitions, events, pool, projects, rounds
+from service import events, explorations, leases, pool, projects, rounds
 from service.actions import check_actions
 from service.errors import (
-    BudgetExhausted,
     InvalidField,
     InvalidLabel,
     InvalidLeaseToken,
@@ -34,12 +35,16 @@ from service.pool import StoredTrajectory
 from service.store.queries import acquisitions as claim_queries
 from service.store.queries import labels as queries
 from service.store.queries import pool as pool_queries
-from service.store.tables import AcquisitionRow, LabelRow, MembershipRow, ProjectRow
+from service.store.queries.segments import Segment
+from service.store.tables import AcquisitionRow, ClaimRow, LabelRow, MembershipRow, ProjectRow
 
 
 @dataclass(frozen=True)
 class LabeledUpload:
-    """A labeled trajectory whose blob is written: all its actions, and the segments to record (None: all)."""
+    """A labeled trajectory whose blob is written: all its actions, and the segments to record (None: all).
+
+    rank: the explore item that it answers.
+    """
 
     stored: StoredTrajectory
     actions: Sequence[Action]
@@ -47,6 +52,27 @@ class LabeledUpload:
     starts: Sequence[int] | None
     split: SplitChoice
     provenance_sha256: str | None = None
+    rank: int | None = None
+
+
+@dataclass
+class _Batch:
+    """One request while it is accepted: what is there of its segments, and what comes of it.
+
+    explored: segments that explore items brought; their labels were reserved by the acquisition, not by a claim.
+    """
+
+    project: ProjectRow
+    source: LabelSource
+    acquisition: AcquisitionRow | None
+    now: datetime
+    members: dict[str, MembershipRow]
+    labels: dict[Segment, LabelRow]
+    claims: dict[Segment, ClaimRow]
+    explored: frozenset[Segment]
+    receipts: list[LabelReceipt] = field(default_factory=list)
+    created: list[LabelRow] = field(default_factory=list)
+    unreserved: int = 0
 
 
 def accept(
@@ -57,27 +83,26 @@ def accept(
     uploads: the request's labeled trajectories, stored. Raises UnknownResource, InvalidLabel, InvalidLeaseToken,
     LeaseLost, SegmentLeased, LabelConflict, SplitConflict, BudgetExhausted.
     """
+    pool.keep(session, [upload.stored for upload in uploads], now)
     project = projects.find(session, request.project, lock=True)
     acquisition = _acquisition(session, project, request)
-    receipts = []
-    for upload in uploads:
-        pool.add(session, project, upload.stored, upload.split, now, upload.provenance_sha256)
-        for item in _items(project, upload):
-            receipts.append(_accept_item(session, project, item, request.source, acquisition, now))
-    for item in request.items:
-        receipts.append(_accept_item(session, project, item, request.source, acquisition, now))
+    uploaded, reserved = _take_uploads(session, project, acquisition, uploads, now)
+    items = [item for item, _ in uploaded] + list(request.items)
+    explored = frozenset((item.trajectory, item.start) for item, explores in uploaded if explores)
+    batch = _batch(session, project, request.source, acquisition, items, explored, now)
+    for item in items:
+        batch.receipts.append(_accept_item(batch, item))
+    _store(session, batch)
     if acquisition is not None:
-        acquisitions.close_if_labeled(session, acquisition, now)
-    created = sum(receipt.status == "created" for receipt in receipts)
-    _check_budget(project, created)
-    if created:
-        data: dict[str, object] = {"count": created, "watermark": project.label_watermark, "by": request.source.name}
-        events.record(session, project.id, "labels.accepted", data, now)
-    round_row = rounds.request(session, project, now, max_attempts) if created and rounds.due(project) else None
+        leases.close_if_labeled(session, acquisition, now)
+    if batch.unreserved > reserved:
+        leases.check_budget(session, project, batch.unreserved - reserved, now)
+    wanted = bool(batch.created) and rounds.due(project)
+    round_row = rounds.request(session, project, now, max_attempts) if wanted else None
     return LabelsAccepted(
-        receipts=receipts,
-        created=created,
-        duplicates=len(receipts) - created,
+        receipts=batch.receipts,
+        created=len(batch.created),
+        duplicates=len(batch.receipts) - len(batch.created),
         watermark=project.label_watermark,
         round=round_row.id if round_row else None,
     )
@@ -101,24 +126,65 @@ def describe(row: LabelRow) -> Label:
     )
 
 
-def _accept_item(
+def _take_uploads(
     session: Session,
     project: ProjectRow,
-    item: LabelItem,
+    acquisition: AcquisitionRow | None,
+    uploads: Sequence[LabeledUpload],
+    now: datetime,
+) -> tuple[list[tuple[LabelItem, bool]], int]:
+    """The labels of uploaded trajectories, which become members first, and whether they answer an exploration; and how
+    many labels live leases had reserved for such answers."""
+    taken, reserved = [], 0
+    for position, upload in enumerate(uploads):
+        explores = upload.rank is not None
+        split: SplitChoice = "pool" if explores else upload.split
+        pool.add(session, project, upload.stored, split, now, upload.provenance_sha256)
+        if upload.rank is not None:
+            name = upload.stored.id
+            reserved += explorations.answer(session, project, acquisition, upload.rank, name, position, now)
+        taken += [(item, explores) for item in _items(project, upload)]
+    return taken, reserved
+
+
+def _batch(
+    session: Session,
+    project: ProjectRow,
     source: LabelSource,
     acquisition: AcquisitionRow | None,
+    items: Sequence[LabelItem],
+    explored: frozenset[Segment],
     now: datetime,
-) -> LabelReceipt:
-    member = _member(session, project, item)
-    _check_segment(session, project, member, item)
-    digest = _content_sha256(item)
-    stored = queries.label_of(session, project.id, item.trajectory, item.start)
+) -> _Batch:
+    """A few statements for any number of items, which all fit their segments."""
+    members = pool_queries.memberships_of(session, project.id, sorted({item.trajectory for item in items}))
+    spaces = projects.spaces_of(project)
+    for item in items:
+        _check_segment(project, spaces, members.get(item.trajectory), item)
+    segments = [(item.trajectory, item.start) for item in items]
+    return _Batch(
+        project=project,
+        source=source,
+        acquisition=acquisition,
+        now=now,
+        members=members,
+        labels=queries.labels_of(session, project.id, segments),
+        claims=claim_queries.claims_on(session, project.id, segments),
+        explored=explored,
+    )
+
+
+def _accept_item(batch: _Batch, item: LabelItem) -> LabelReceipt:
+    member = batch.members[item.trajectory]
+    digest, segment = _content_sha256(item), (item.trajectory, item.start)
+    stored = batch.labels.get(segment)
     if stored is not None:
         if stored.content_sha256 != digest:
             raise LabelConflict(item.trajectory, item.start, _shown(stored), _shown(item))
         return _receipt(item, member, "duplicate")
-    _check_lease(session, project, item, acquisition, now)
-    _store(session, project, member, item, digest, source, acquisition, now)
+    _check_lease(batch, item)
+    batch.labels[segment] = _row(batch, member, item, digest)
+    batch.created.append(batch.labels[segment])
     return _receipt(item, member, "created")
 
 
@@ -127,19 +193,12 @@ def _acquisition(session: Session, project: ProjectRow, request: LabelsRequest) 
         if request.token is not None:
             raise InvalidField("token", request.token, "needs the acquisition that it belongs to")
         return None
-    row = acquisitions.find(session, request.acquisition)
+    row = leases.find(session, request.acquisition)
     if row.project_id != project.id:
         raise UnknownResource(f"acquisition of project {project.id}", request.acquisition)
     if request.token != row.token:
         raise InvalidLeaseToken(row.id, request.token)
     return row
-
-
-def _check_budget(project: ProjectRow, created: int) -> None:
-    """Acquired labels were reserved; uploads without a lease must find room too."""
-    total = projects.policy_of(project).label_budget
-    if total is not None and project.pool_labels > total:
-        raise BudgetExhausted(created, total - (project.pool_labels - created), total)
 
 
 def _items(project: ProjectRow, upload: LabeledUpload) -> list[LabelItem]:
@@ -166,19 +225,14 @@ def _items(project: ProjectRow, upload: LabeledUpload) -> list[LabelItem]:
     ]
 
 
-def _member(session: Session, project: ProjectRow, item: LabelItem) -> MembershipRow:
-    member = pool_queries.membership(session, project.id, item.trajectory)
+def _check_segment(project: ProjectRow, spaces: Spaces, member: MembershipRow | None, item: LabelItem) -> None:
     if member is None:
         raise UnknownResource(f"trajectory in project {project.id}", item.trajectory)
-    return member
-
-
-def _check_segment(session: Session, project: ProjectRow, member: MembershipRow, item: LabelItem) -> None:
-    name = f"segment {item.trajectory}:{item.start}"
+    name, length = f"segment {item.trajectory}:{item.start}", project.segment_length
     _check_start(project, member.segments, item.start, f"{name}.start")
-    if len(item.actions) != project.segment_length:
-        raise InvalidLabel(f"{name}.actions: length", len(item.actions), f"must be {project.segment_length}")
-    check_actions(projects.spaces_of(project), item.actions, item.action_sets, name)
+    if len(item.actions) != length:
+        raise InvalidLabel(f"{name}.actions: length", len(item.actions), f"must be {length}")
+    check_actions(spaces, item.actions, item.action_sets, name)
 
 
 def _check_start(project: ProjectRow, segments: int, start: int, name: str) -> None:
@@ -189,32 +243,30 @@ def _check_start(project: ProjectRow, segments: int, start: int, name: str) -> N
         raise InvalidLabel(name, start, f"must be a multiple of {project.stride} up to {last}")
 
 
-def _check_lease(
-    session: Session, project: ProjectRow, item: LabelItem, acquisition: AcquisitionRow | None, now: datetime
-) -> None:
-    """A segment takes labels from the holder of its newest claim, or from anybody while no lease on it lives."""
-    claim = claim_queries.claim_on(session, project.id, item.trajectory, item.start)
-    if acquisition is not None and (claim is None or claim.token != acquisition.token):
+def _check_lease(batch: _Batch, item: LabelItem) -> None:
+    """A segment takes labels from the holder of its newest claim, or from anybody while no lease on it lives.
+
+    What no live claim had reserved needs room in the budget: an answer after the lease's end, an upload without one.
+    """
+    segment = (item.trajectory, item.start)
+    claim, acquisition = batch.claims.get(segment), batch.acquisition
+    holds = claim is not None and acquisition is not None and claim.token == acquisition.token
+    lives = claim is not None and claim.expires_at > batch.now
+    if acquisition is not None and not holds and segment not in batch.explored:
         raise LeaseLost(acquisition.id, f"it does not hold segment {item.trajectory}:{item.start}")
-    if acquisition is None and claim is not None and claim.expires_at > now:
+    if claim is not None and lives and not holds:
         raise SegmentLeased(item.trajectory, item.start, claim.expires_at)
-    if claim is not None:
-        session.delete(claim)
+    batch.unreserved += not (holds and lives) and batch.members[item.trajectory].split == "pool"
 
 
-def _store(
-    session: Session,
-    project: ProjectRow,
-    member: MembershipRow,
-    item: LabelItem,
-    digest: str,
-    source: LabelSource,
-    acquisition: AcquisitionRow | None,
-    now: datetime,
-) -> None:
+def _row(batch: _Batch, member: MembershipRow, item: LabelItem, digest: str) -> LabelRow:
+    """The next label of the project; its watermark is taken under the project's lock."""
+    project = batch.project
     project.label_watermark += 1
     project.pool_labels += member.split == "pool"
-    row = LabelRow(
+    project.held_out_labels += member.split == "held_out"
+    return LabelRow(
+        id=uuid4(),
         project_id=project.id,
         trajectory_id=item.trajectory,
         start=item.start,
@@ -223,13 +275,29 @@ def _store(
         action_sets=None if item.action_sets is None else list(item.action_sets),
         content_sha256=digest,
         residual=item.residual,
-        source=source.model_dump(mode="json"),
-        acquisition_id=acquisition.id if acquisition else None,
+        source=batch.source.model_dump(mode="json"),
+        acquisition_id=batch.acquisition.id if batch.acquisition else None,
         watermark=project.label_watermark,
-        created_at=now,
+        created_at=batch.now,
     )
-    session.add(row)
-    claim_queries.drop_from_queues(session, project.id, item.trajectory, item.start)
+
+
+def _store(session: Session, batch: _Batch) -> None:
+    """The new labels, and what follows: their segments are claimed by nobody and stand in no queue."""
+    if not batch.created:
+        return
+    project, segments = batch.project, [(row.trajectory_id, row.start) for row in batch.created]
+    queries.insert(session, batch.created)
+    claim_queries.drop_claims(session, project.id, [segment for segment in segments if segment in batch.claims])
+    claim_queries.drop_from_queues(session, project.id, segments)
+    data: dict[str, object] = {
+        "count": len(batch.created),
+        "first": batch.created[0].watermark,
+        "watermark": project.label_watermark,
+        "by": batch.source.name,
+        "acquisition": str(batch.acquisition.id) if batch.acquisition else None,
+    }
+    events.record(session, project.id, "labels.accepted", data, batch.now)
 
 
 def _content_sha256(item: LabelItem) -> str:

@@ -1,6 +1,6 @@
 """The pool: trajectories and their membership in a project."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -58,6 +58,13 @@ def check(spaces: Spaces, arrays: Mapping[str, NDArray[Any]], source: str) -> No
         raise InvalidTrajectory(f"{source}: length", min(lengths.values()), "must be at least 2 observations")
 
 
+def keep(session: Session, stored: Sequence[StoredTrajectory], now: datetime) -> None:
+    """Write the contents' rows, before any project is locked and in one order for all: two projects that are given the
+    same trajectories at the same time wait for each other once, and never both at once."""
+    for each in sorted(stored, key=lambda one: one.id):
+        queries.keep_content(session, _trajectory_row(each, now))
+
+
 def add(
     session: Session,
     project: ProjectRow,
@@ -84,6 +91,12 @@ def add(
     )
     session.add(member)
     session.flush()
+    if member.split == "pool":
+        project.pool_trajectories += 1
+        project.pool_segments += member.segments
+    else:
+        project.held_out_trajectories += 1
+        project.held_out_segments += member.segments
     events.record(session, project.id, "trajectory.added", {"trajectory": stored.id, "split": member.split}, now)
     return _receipt(stored, member, "created")
 

@@ -1,5 +1,6 @@
 """Projects: one environment, one model family, one labeling policy."""
 
+from dataclasses import dataclass
 from datetime import datetime
 from uuid import UUID
 
@@ -10,9 +11,10 @@ from api_schemas.environments import Environment, Spaces
 from api_schemas.projects import Budget, LabelingPolicy, PoolCounts, Project, ProjectCreate, ProjectPatch
 from service import events
 from service.errors import NameTaken, UnknownResource
+from service.store.queries import acquisitions as acquisition_queries
 from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
-from service.store.queries.pool import SplitCount
+from service.store.queries import rows
 from service.store.tables import ProjectRow
 
 
@@ -43,7 +45,7 @@ def create(session: Session, request: ProjectCreate, now: datetime) -> ProjectRo
 
 def find(session: Session, project_id: UUID, *, lock: bool = False) -> ProjectRow:
     """The project's row, locked on demand where the database locks rows. Raises UnknownResource."""
-    row = session.get(ProjectRow, project_id, with_for_update=lock)
+    row = rows.get(session, ProjectRow, project_id, lock=lock)
     if row is None:
         raise UnknownResource("project", project_id)
     return row
@@ -74,17 +76,40 @@ def environment_of(row: ProjectRow) -> Environment:
     return Environment.model_validate(row.environment)
 
 
-def budget_of(row: ProjectRow, pool: SplitCount) -> Budget:
-    """Labels spent and reserved against the budget, from the counts of the pool split."""
+@dataclass(frozen=True)
+class SplitCount:
+    """Trajectories and segments of one split; live leases and labels among them."""
+
+    trajectories: int
+    segments: int
+    leased: int
+    labeled: int
+
+    @property
+    def free(self) -> int:
+        """Segments that are neither leased nor labeled."""
+        return self.segments - self.leased - self.labeled
+
+
+def split_count(session: Session, row: ProjectRow, split: str, now: datetime) -> SplitCount:
+    """Counts of one split at `now`, from the project's counters: at any size as quick."""
+    leased = pool_queries.leased(session, row.id, split, now)
+    if split == "pool":
+        return SplitCount(row.pool_trajectories, row.pool_segments, leased, row.pool_labels)
+    return SplitCount(row.held_out_trajectories, row.held_out_segments, leased, row.held_out_labels)
+
+
+def budget_of(session: Session, row: ProjectRow, now: datetime) -> Budget:
+    """Labels spent on the pool, and reserved by live leases, against the budget."""
     total = policy_of(row).label_budget
-    remaining = None if total is None else max(0, total - pool.labeled - pool.leased)
-    return Budget(total=total, spent=pool.labeled, reserved=pool.leased, remaining=remaining)
+    reserved = acquisition_queries.reserved(session, row.id, now)
+    remaining = None if total is None else max(0, total - row.pool_labels - reserved)
+    return Budget(total=total, spent=row.pool_labels, reserved=reserved, remaining=remaining)
 
 
 def describe(session: Session, row: ProjectRow, now: datetime) -> Project:
     """The project as the API shows it."""
-    pool = pool_queries.split_count(session, row.id, "pool", now)
-    held_out = pool_queries.split_count(session, row.id, "held_out", now)
+    pool, held_out = split_count(session, row, "pool", now), split_count(session, row, "held_out", now)
     current = round_queries.current_round(session, row.id)
     counts = PoolCounts(
         pool_trajectories=pool.trajectories,
@@ -107,7 +132,7 @@ def describe(session: Session, row: ProjectRow, now: datetime) -> Project:
         seed=row.seed,
         policy=policy_of(row),
         counts=counts,
-        budget=budget_of(row, pool),
+        budget=budget_of(session, row, now),
         label_watermark=row.label_watermark,
         current_round=current.id if current else None,
         created_at=row.created_at,

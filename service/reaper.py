@@ -1,10 +1,11 @@
-"""What follows when a job gives up or its worker falls silent."""
+"""What time alone brings about: workers fall silent, leases and kept answers expire; and what follows from it."""
 
 from datetime import datetime, timedelta
 
 from sqlalchemy.orm import Session
 
-from service import jobs, rounds, scorings
+from service import jobs, leases, origin, rounds, scorings
+from service.store.queries import idempotency as idempotency_queries
 from service.store.queries import jobs as job_queries
 from service.store.tables import JobRow
 
@@ -13,9 +14,13 @@ WORKER_MEMORY = timedelta(hours=1)
 
 def reap(session: Session, now: datetime) -> None:
     """Queue the jobs of silent workers again; what has used up its attempts fails with all that waits for it."""
-    for row in jobs.reap(session, now):
-        give_up(session, row, now)
-    job_queries.forget_workers(session, now - WORKER_MEMORY)
+    with origin.bound(actor="reaper"):
+        for row in jobs.reap(session, now):
+            with origin.bound(correlation=row.correlation):
+                give_up(session, row, now)
+        leases.note_expired(session, now)
+        job_queries.forget_workers(session, now - WORKER_MEMORY)
+        idempotency_queries.forget_expired(session, now)
 
 
 def give_up(session: Session, row: JobRow, now: datetime) -> None:

@@ -11,8 +11,8 @@ from service import events, jobs, projects
 from service.errors import NoModelFamily, NothingToLearn, UnknownResource
 from service.store.queries import jobs as job_queries
 from service.store.queries import labels as label_queries
-from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as queries
+from service.store.queries import rows
 from service.store.tables import ModelVersionRow, ProjectRow, RoundRow
 
 
@@ -58,7 +58,7 @@ def due(project: ProjectRow) -> bool:
 
 def find(session: Session, round_id: UUID, *, lock: bool = False) -> RoundRow:
     """The round's row. Raises UnknownResource."""
-    row = session.get(RoundRow, round_id, with_for_update=lock)
+    row = rows.get(session, RoundRow, round_id, lock=lock)
     if row is None:
         raise UnknownResource("round", round_id)
     return row
@@ -94,7 +94,7 @@ def make_current(session: Session, round_id: UUID, now: datetime) -> None:
     """The round's queue is ready: its models and queue are in use from now on. An older round never replaces it."""
     projects.find(session, find(session, round_id).project_id, lock=True)  # one round at a time becomes current
     row = find(session, round_id, lock=True)
-    if row.status in ("current", "superseded", "failed"):
+    if row.status in ("current", "superseded", "failed", "cancelled"):
         return
     current = queries.current_round(session, row.project_id)
     if current is not None and current.number > row.number:
@@ -110,13 +110,23 @@ def make_current(session: Session, round_id: UUID, now: datetime) -> None:
 
 def fail(session: Session, round_id: UUID, error: str, now: datetime) -> None:
     """The round's job gave up; a round that is in use stays in use."""
+    project = projects.find(session, find(session, round_id).project_id, lock=True)  # the project always comes first
     row = find(session, round_id, lock=True)
-    if row.status in ("current", "superseded"):
+    if row.status in ("current", "superseded", "cancelled"):
         return
     row.status, row.error, row.finished_at = "failed", error, now
-    project = projects.find(session, row.project_id, lock=True)
     project.labels_at_round = 0  # its labels are due again: the next one that is accepted asks for a round
     events.record(session, row.project_id, "round.failed", {"round": str(row.id), "error": error}, now)
+
+
+def cancel(session: Session, round_id: UUID, now: datetime) -> None:
+    """Somebody stopped the round; its labels are not due again. A round that is in use or has ended stays as it is."""
+    projects.find(session, find(session, round_id).project_id, lock=True)
+    row = find(session, round_id, lock=True)
+    if row.status not in ("queued", "training", "scoring"):
+        return
+    row.status, row.finished_at = "cancelled", now
+    events.record(session, row.project_id, "round.cancelled", {"round": str(row.id), "number": row.number}, now)
 
 
 def curve(session: Session, project: ProjectRow) -> ModelErrorCurve:
@@ -163,8 +173,7 @@ def _supersede_queued(session: Session, row: RoundRow, now: datetime) -> None:
 def _request_subgoal_generator(session: Session, project: ProjectRow, now: datetime, max_attempts: int) -> None:
     """The generator learns from action-free data only, so it follows the pool's growth and not the labels."""
     newest = queries.newest_model(session, project.id, "subgoal_generator")
-    members = pool_queries.split_count(session, project.id, "pool", now).trajectories
-    if newest is not None and members < 2 * newest.watermark:
+    if newest is not None and project.pool_trajectories < 2 * newest.watermark:
         return
     if job_queries.unfinished(session, project.id, "train_subgoal_generator") is None:
         payload = TrainSubgoalGenerator(project=project.id)

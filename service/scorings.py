@@ -16,6 +16,7 @@ from service.store.queries import acquisitions as queries
 from service.store.queries import jobs as job_queries
 from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
+from service.store.queries import rows
 from service.store.tables import JobRow, ProjectRow, QueueRow, RoundRow, ScoringRow, ShardRow
 
 NEEDS: dict[str, frozenset[str]] = {strategy.name: frozenset(strategy.needs) for strategy in CATALOG}
@@ -44,15 +45,22 @@ class Ranked:
     score: float
 
 
+def ready(session: Session, project: ProjectRow, requested: str) -> ScoringRow | None:
+    """The scoring whose queue may be read at once; None where `usable` has something to start or to wait for."""
+    strategy, round_row = _ranking(session, project, requested)
+    newest = queries.newest_scoring(session, project.id, strategy, round_row.id if round_row else None)
+    if newest is None or newest.status != "ready" or (round_row is None and _outgrown(session, newest)):
+        return None
+    return newest
+
+
 def usable(session: Session, project: ProjectRow, requested: str, now: datetime, limits: Limits) -> ScoringRow | JobRow:
     """A scoring whose queue is ready, or the job that will make one.
 
     Before the first round a strategy that needs models falls back on COLD_START_STRATEGY. A model's scores hold for
     the pool as it was scored; a model-free scoring is made anew when the pool has grown, while the old queue serves on.
     """
-    current = round_queries.current_round(session, project.id)
-    strategy = requested if current or not NEEDS[requested] else COLD_START_STRATEGY
-    round_row = current if NEEDS[strategy] else None
+    strategy, round_row = _ranking(session, project, requested)
     newest = queries.newest_scoring(session, project.id, strategy, round_row.id if round_row else None)
     if newest is None:
         return _request(session, project, strategy, round_row, now, limits)
@@ -147,7 +155,7 @@ def publish(session: Session, scoring_id: UUID, ranked: Sequence[Ranked]) -> Sco
 
 def find(session: Session, scoring_id: UUID, *, lock: bool = False) -> ScoringRow:
     """The scoring's row. Raises UnknownResource."""
-    row = session.get(ScoringRow, scoring_id, with_for_update=lock)
+    row = rows.get(session, ScoringRow, scoring_id, lock=lock)
     if row is None:
         raise UnknownResource("scoring", scoring_id)
     return row
@@ -156,6 +164,13 @@ def find(session: Session, scoring_id: UUID, *, lock: bool = False) -> ScoringRo
 def fail(session: Session, scoring_id: UUID) -> None:
     """A scoring whose job gave up is not used; the next acquire starts another."""
     find(session, scoring_id, lock=True).status = "failed"
+
+
+def _ranking(session: Session, project: ProjectRow, requested: str) -> tuple[str, RoundRow | None]:
+    """The strategy that ranks, and the round under whose models; a cold start has neither round nor choice."""
+    current = round_queries.current_round(session, project.id)
+    strategy = requested if current or not NEEDS[requested] else COLD_START_STRATEGY
+    return strategy, current if NEEDS[strategy] else None
 
 
 def _request(

@@ -24,18 +24,29 @@ class Settings(BaseSettings):
     broker_url: str = ""
     celery_prefix: str = "asim"
     job_lease_seconds: float = Field(default=15.0, gt=0)
-    job_max_attempts: int = Field(default=5, ge=1)
+    job_max_attempts: int = Field(default=3, ge=1)
+    checkpoint_seconds: float = Field(default=10.0, gt=0, description="a stage of training is kept this often")
+    canary_seconds: float = Field(default=60.0, gt=0, description="ready while a canary of each queue is this young")
+    resend_seconds: float = Field(default=15.0, gt=0, description="a sent job that nobody claimed may be sent again")
+    visibility_seconds: float = Field(default=900.0, gt=0, description="after it, Redis returns a lost message")
+    idempotency_hours: float = Field(default=168.0, gt=0, description="a key of a request is remembered this long")
     poll_seconds: float = Field(default=0.2, gt=0)
     queue_length: int = Field(default=2000, ge=1, description="ranked segments kept ready in the database")
     shard_transitions: int = Field(default=100_000, ge=1)
     torch_threads: int = Field(default=1, ge=1)
     allowed_hosts: tuple[str, ...] = ("127.0.0.1", "localhost", "[::1]")
     max_body_bytes: int = Field(default=256 * 2**20, ge=1)
+    max_labels_bytes: int = Field(default=64 * 2**20, ge=1)
 
     @property
     def embedded(self) -> bool:
         """True where no broker carries jobs."""
         return not self.broker_url
+
+    @property
+    def redis_broker(self) -> bool:
+        """True where the broker is Redis, whose transport has options of its own."""
+        return self.broker_url.startswith(("redis", "sentinel", "valkey"))
 
     def resolved_database_url(self) -> str:
         """The given URL, or a SQLite file in the data folder."""

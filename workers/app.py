@@ -13,21 +13,26 @@ from types import FrameType
 from typing import get_args
 from uuid import UUID
 
-from billiard import active_children  # type: ignore[import-untyped]  # billiard has no types
+from billiard import active_children, current_process  # type: ignore[import-untyped]  # billiard has no types
 from celery.signals import worker_process_init, worker_ready, worker_shutting_down
+from celery.worker import state as celery_state
+from kombu.exceptions import OperationalError as BrokerError
 from sqlalchemy.exc import SQLAlchemyError
 
 from api_schemas.jobs import RUN_JOB, Queue
 from service import jobs
-from service.carrier import celery_app
+from service.carrier import celery_app, impatient_app, messages_in
 from service.clock import utc_now
 from service.log import configure_logs, get_logger
 from service.settings import Settings
+from workers.consumption import Consumption
 from workers.dispatch import open_worker
 from workers.dispatch import run_job as run_job_here
 from workers.job import Worker
+from workers.orphans import end_with
 
 log = get_logger("worker")
+STALLED = 4  # exit status
 STOP = signal.SIGUSR2  # from the parent to its children: SIGTERM and SIGUSR1 have a meaning of their own in Celery
 
 
@@ -66,6 +71,7 @@ def worker() -> Worker:
 
 @worker_process_init.connect  # type: ignore[untyped-decorator]  # celery has no types
 def _prepare_child(**_: object) -> None:
+    end_with(current_process()._parent_pid)  # not os.getppid(): the parent may be gone by now
     from workers.runner import prepare_science
 
     configure_logs()
@@ -94,11 +100,35 @@ def _say_alive(**_: object) -> None:
 def _beat() -> None:
     from workers.runner import ALIVE_SECONDS
 
-    parent = worker()
+    parent, watch = worker(), _consumption(worker())
     while not parent.stopping.is_set():
         try:
             with parent.database.write() as session:
                 jobs.worker_alive(session, parent.owner, parent.queues, parent.clock())
+            _end_if_stalled(watch)
         except SQLAlchemyError as error:  # the next beat tries again
             log.warning("database_unreachable", error=str(error))
         parent.stopping.wait(ALIVE_SECONDS)
+
+
+def _consumption(parent: Worker) -> Consumption:
+    broker = impatient_app(settings)
+    return Consumption(
+        parent,
+        taken=lambda: int(celery_state.all_total_count[0]),
+        holds=lambda: bool(celery_state.reserved_requests),
+        processes=lambda: [os.getpid(), *(child.pid for child in active_children())],
+        messages_in=lambda queue: messages_in(broker, f"{settings.celery_prefix}.{queue}"),
+    )
+
+
+def _end_if_stalled(watch: Consumption) -> None:
+    """Whatever supervises this worker starts it again, with connections that work; its children end with it."""
+    try:
+        reason = watch.stalled()
+    except BrokerError as error:  # without a broker there is nothing to consume
+        log.warning("broker_unreachable", error=str(error))
+        return
+    if reason is not None:
+        log.error("worker_stalled", reason=reason)
+        os._exit(STALLED)

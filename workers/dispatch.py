@@ -10,6 +10,7 @@ import structlog
 from sqlalchemy.exc import SQLAlchemyError
 
 from api_schemas.jobs import (
+    Canary,
     Collect,
     JobPayload,
     MergeScores,
@@ -18,7 +19,7 @@ from api_schemas.jobs import (
     TrainRound,
     TrainSubgoalGenerator,
 )
-from service import jobs, reaper
+from service import canary, jobs, origin, reaper
 from service.errors import JobLost
 from service.log import get_logger
 from service.settings import Settings
@@ -41,7 +42,7 @@ def open_worker(settings: Settings, clock: Callable[[], datetime], queues: tuple
 
 def run_next(worker: Worker) -> bool:
     """Claim and run the next job of the worker's queues; False where none waits."""
-    with worker.database.write() as session:
+    with origin.bound(actor=worker.owner), worker.database.write() as session:
         lease = worker.settings.job_lease_seconds
         row = jobs.claim_next(session, worker.queues, worker.owner, worker.clock(), lease)
     if row is not None:
@@ -51,7 +52,7 @@ def run_next(worker: Worker) -> bool:
 
 def run_job(worker: Worker, job_id: UUID) -> bool:
     """Claim and run this job; False where it is done or held by another, as when a message arrives twice."""
-    with worker.database.write() as session:
+    with origin.bound(actor=worker.owner), worker.database.write() as session:
         row = jobs.claim(session, job_id, worker.owner, worker.clock(), worker.settings.job_lease_seconds)
     if row is not None:
         run_claimed(worker, row)
@@ -61,14 +62,18 @@ def run_job(worker: Worker, job_id: UUID) -> bool:
 def run_claimed(worker: Worker, row: JobRow) -> None:
     """Run a job that this worker has claimed, to one of its ends."""
     job = RunningJob(worker, jobs.lease_of(row))
-    with structlog.contextvars.bound_contextvars(job=str(row.id), kind=row.kind, attempt=row.attempts):
-        log.info("job_started")
+    with (
+        origin.bound(worker.owner, row.correlation),
+        structlog.contextvars.bound_contextvars(job=str(row.id), kind=row.kind, attempt=row.attempts),
+    ):
+        tell = log.debug if row.kind == "canary" else log.info  # of canaries the failures are enough
+        tell("job_started")
         try:
             with Heartbeat(job):
                 result = _run(job, jobs.payload_of(row))
             with worker.database.write() as session:
                 jobs.complete(session, job.lease, result, job.now())
-            log.info("job_done", result=result)
+            tell("job_done", result=result)
         except JobLost as lost:
             log.warning("job_lost", error=str(lost))
         except GaveWay as reason:
@@ -97,14 +102,13 @@ def _run(job: RunningJob, payload: JobPayload) -> Result:
             from workers.scoring import run_shard
 
             return run_shard(job, payload)
-        case MergeScores():
+        case MergeScores() | SelectQueue():
             from workers.scoring import run_selection
 
-            return run_selection(job, payload.scoring, job.worker.settings.queue_length)
-        case SelectQueue():
-            from workers.scoring import run_selection
-
-            return run_selection(job, payload.scoring, payload.length)
+            length = payload.length if isinstance(payload, SelectQueue) else job.worker.settings.queue_length
+            return run_selection(job, payload.scoring, length)
+        case Canary():
+            return canary.done(job.now())
 
 
 def _give_back(job: RunningJob, reason: GaveWay) -> None:

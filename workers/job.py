@@ -74,11 +74,12 @@ class RunningJob:
             return queries.higher_waiting(session, self.worker.queues, self.lease.priority, self.now())
 
     def beat(self) -> None:
-        """Renew the lease once."""
-        seconds = self.worker.settings.job_lease_seconds
+        """Renew the lease once, and say that this worker is there: a Celery child has nobody else to say it."""
+        worker, seconds = self.worker, self.worker.settings.job_lease_seconds
         try:
-            with self.worker.database.write() as session:
+            with worker.database.write() as session:
                 jobs.heartbeat(session, self.lease, self.now(), seconds, self._progress, self._message)
+                jobs.worker_alive(session, worker.owner, worker.queues, self.now())
         except JobLost:
             self._lost.set()
         except SQLAlchemyError as error:  # the next beat tries again; the lease outlasts a few of them

@@ -7,7 +7,6 @@ It ends on SIGTERM and SIGINT, giving its job back, and by itself when its paren
 
 import argparse
 import gc
-import os
 import signal
 import threading
 import time
@@ -15,12 +14,13 @@ from types import FrameType
 
 from sqlalchemy.exc import OperationalError
 
-from service import jobs, reaper
+from service import canary, jobs, reaper
 from service.clock import utc_now
 from service.log import configure_logs, get_logger
 from service.settings import Settings
 from workers.dispatch import open_worker, run_next
 from workers.job import Worker
+from workers.orphans import end_with
 
 log = get_logger("runner")
 ALIVE_SECONDS = 5.0
@@ -36,6 +36,7 @@ def run(worker: Worker) -> None:
             if time.monotonic() - reaped > REAP_SECONDS:
                 with worker.database.write() as session:
                     reaper.reap(session, worker.clock())
+                    canary.plant(session, worker.clock(), worker.settings.canary_seconds / 4)
                 reaped = time.monotonic()
             if not run_next(worker):
                 worker.stopping.wait(worker.settings.poll_seconds)
@@ -74,7 +75,7 @@ def main() -> None:
     worker = open_worker(settings, utc_now, queues)
     _stop_on_signals(worker)
     if options.parent is not None:
-        threading.Thread(target=_end_with, args=(options.parent,), name="parent", daemon=True).start()
+        end_with(options.parent)
     log.info("runner_started", owner=worker.owner, queues=queues)
     run(worker)
 
@@ -97,13 +98,6 @@ def _stop_on_signals(worker: Worker) -> None:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-
-
-def _end_with(parent: int) -> None:
-    """An orphan must not work on beside the runner that a new parent starts."""
-    while os.getppid() == parent:
-        time.sleep(0.5)
-    os._exit(3)
 
 
 if __name__ == "__main__":

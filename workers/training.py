@@ -9,8 +9,9 @@ import torch
 from api_schemas.jobs import TrainRound, TrainSubgoalGenerator
 from models import checkpoints
 from models.families import Family, family_named
+from models.network import Network
 from models.segments import SegmentBatch
-from models.training import TrainingState, begin, train, train_subgoal_generator
+from models.training import TrainingState
 from service import jobs, projects, registry, rounds, scorings
 from service.errors import NoModelFamily, NothingToLearn
 from service.registry import TrainedModel
@@ -20,14 +21,13 @@ from service.store.queries import rounds as round_queries
 from service.store.tables import JobRow, ProjectRow, RoundRow
 from workers import data
 from workers.evaluation import model_error
-from workers.job import GaveWay, RunningJob
+from workers.job import RunningJob
+from workers.stage import Stage
 
 ENSEMBLE_MEMBERS = 3
 BASE = frozenset({"inverse_dynamics", "world_model"})  # every round has these; model error is theirs
 ORDER = ("inverse_dynamics", "dense_inverse_dynamics", "world_model", "ensemble")
-SUBGOAL_SLICE = 5  # steps between two looks at whether other work waits
 SUBGOAL_SEGMENTS = 50_000  # a larger pool is thinned out evenly
-CHECKPOINT_SECONDS = 30.0
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Plan:
 def run_round(job: RunningJob, payload: TrainRound) -> dict[str, object]:
     """Bring a round to where its scoring begins. May run twice, and after a crash at any line."""
     plan = _plan(job, payload)
-    if plan.round.status in ("superseded", "failed"):
+    if plan.round.status in ("superseded", "failed", "cancelled"):
         return {"round": str(plan.round.id), "status": plan.round.status}
     with job.transaction() as session:
         rounds.begin_training(session, plan.round.id)
@@ -81,20 +81,14 @@ def run_subgoal_generator(job: RunningJob, payload: TrainSubgoalGenerator) -> di
     generator = _generator(project, 0, "subgoal_generator", 0)
     network = family.build_subgoal_generator(data.model_spaces(projects.spaces_of(project)), None, generator)
     config = family.training_config("subgoal_generator", batch.size)
-    state = _resume(job) or begin(network, config, generator)
-    saved = time.monotonic()
-    while state.step < state.config.steps:
-        if job.should_give_way():
-            _save_state(job, state)
-            raise GaveWay(f"other work waits at step {state.step} of {state.config.steps}")
-        if time.monotonic() - saved > CHECKPOINT_SECONDS:
-            _save_state(job, state)
-            saved = time.monotonic()
-        job.report(state.step / state.config.steps, f"subgoal generator, step {state.step} of {state.config.steps}")
-        state = train_subgoal_generator(network, batch, state, SUBGOAL_SLICE)
-    blob = checkpoints.save(network)
-    model = _trained(job, "subgoal_generator", 0, blob, {"loss": sum(state.recent) / len(state.recent)})
-    with job.transaction() as session:
+
+    def tell(step: int, steps: int, loss: float) -> None:
+        job.report(step / steps, f"subgoal generator, step {step} of {steps}, loss {loss:.3f}")
+
+    stage = Stage(job, "subgoal_generator", None)
+    state = stage.train(network, batch, config, generator, tell)
+    model = _trained(job, "subgoal_generator", 0, network, state)
+    with stage.finished() as session:
         row = registry.register(session, project.id, None, model, len(members), job.now())
     return {"model": str(row.id), "segments": batch.size}
 
@@ -130,18 +124,18 @@ def _train_stage(job: RunningJob, plan: Plan, kind: str, member: int, labeled: S
     spaces = data.model_spaces(projects.spaces_of(plan.project))
     network = plan.family.build(network_kind, spaces, {}, generator)
 
-    def progress(step: int, steps: int, loss: float) -> None:
+    def tell(step: int, steps: int, loss: float) -> None:
         share = (number + step / steps) / (len(plan.stages) + 1)
         job.report(share, f"round {plan.round.number}: {kind}, step {step} of {steps}, loss {loss:.3f}")
 
     config = plan.family.training_config(network_kind, labeled.size)
-    result = train(network, labeled, config, generator, "cpu", progress)
-    blob = checkpoints.save(network)
-    trained = _trained(job, kind, member, blob, {"loss": result.final_loss})
-    with job.transaction() as session:
+    name = f"{kind}-{member}" if kind == "ensemble" else kind
+    stage = Stage(job, name, plan.round.id)
+    state = stage.train(network, labeled, config, generator, tell)
+    trained = _trained(job, kind, member, network, state)
+    with stage.finished() as session:
         registry.register(session, plan.project.id, plan.round.id, trained, plan.round.watermark, job.now())
         jobs.made_progress(session, job.lease)
-        name = f"{kind}-{member}" if kind == "ensemble" else kind
         rounds.stage_done(session, plan.round.id, name, time.monotonic() - started)
 
 
@@ -181,21 +175,8 @@ def _generator(project: ProjectRow, round_number: int, kind: str, member: int) -
     return torch.Generator().manual_seed(zlib.crc32(text.encode()))
 
 
-def _trained(job: RunningJob, kind: str, member: int, blob: bytes, metrics: dict[str, float]) -> TrainedModel:
+def _trained(job: RunningJob, kind: str, member: int, network: Network, state: TrainingState) -> TrainedModel:
+    metrics, blob = {"loss": sum(state.recent) / len(state.recent)}, checkpoints.save(network)
     description = checkpoints.describe(blob)
     sha256 = job.worker.blobs.put("weights", blob)
     return TrainedModel(kind, member, description["family"], description["config"], sha256, len(blob), metrics)
-
-
-def _resume(job: RunningJob) -> TrainingState | None:
-    """The state that an earlier attempt left."""
-    with job.worker.database.read() as session:
-        row = session.get_one(JobRow, job.lease.job_id)
-        sha256 = row.checkpoint_sha256
-    return TrainingState.from_bytes(job.worker.blobs.get("checkpoints", sha256)) if sha256 else None
-
-
-def _save_state(job: RunningJob, state: TrainingState) -> None:
-    sha256 = job.worker.blobs.put("checkpoints", state.to_bytes())
-    with job.transaction() as session:
-        session.get_one(JobRow, job.lease.job_id).checkpoint_sha256 = sha256

@@ -15,12 +15,17 @@ Url = Annotated[str, typer.Option("--url", envvar="ASIM_URL", help="Where the se
 Key = Annotated[str | None, typer.Option("--key", envvar="ASIM_KEY", help="API key; embedded mode needs none.")]
 ProjectName = Annotated[str, typer.Argument(metavar="PROJECT", help="Name or id of the project.")]
 Strategy = Annotated[str | None, typer.Option(help="random, cycle, vanilla_cycle or uncertainty.")]
+Mode = Annotated[
+    Literal["pool", "explore"],
+    typer.Option(help="Segments of the pool to label, or states to explore from and the actions to execute there."),
+]
 Purpose = Annotated[Literal["pool", "held_out"], typer.Option(help="Label the pool, or the held-out set.")]
 Split = Annotated[
     Literal["auto", "pool", "held_out"], typer.Option(help="Where the trajectories go; auto decides by content hash.")
 ]
 Count = Annotated[int, typer.Option(min=1, help="Segments.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the service's answer as JSON.")]
+JsonLines = Annotated[bool, typer.Option("--json", help="Print what the service answered as JSON, one line each.")]
 
 
 def connect(url: str, key: str | None) -> "Client":

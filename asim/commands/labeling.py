@@ -1,12 +1,16 @@
 """asim acquire, asim label, asim round, asim error: the loop by hand."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from asim.commands.console import DEFAULT_URL, Count, Json, Key, ProjectName, Purpose, Strategy, Url, connect
+from asim.commands.console import DEFAULT_URL, Count, Json, Key, Mode, ProjectName, Purpose, Strategy, Url, connect
 from asim.errors import AsimError
+
+if TYPE_CHECKING:
+    from api_schemas.acquisitions import Acquisition
+    from api_schemas.projects import Project
 
 Wait = Annotated[float, typer.Option(min=0, help="Seconds to wait for a ranked queue.")]
 
@@ -15,6 +19,7 @@ def acquire(
     project: ProjectName,
     *,
     count: Count = 16,
+    mode: Mode = "pool",
     strategy: Strategy = None,
     purpose: Purpose = "pool",
     lease_seconds: Annotated[float | None, typer.Option(help="Default: the project's.")] = None,
@@ -32,6 +37,7 @@ def acquire(
         batch = client.acquire(
             found.id,
             count,
+            mode=mode,
             strategy=strategy,
             purpose=purpose,
             lease_seconds=lease_seconds,
@@ -42,10 +48,12 @@ def acquire(
         typer.echo(batch.model_dump_json(indent=2))
         return
     show(acquisition_table(batch))
+    if batch.reason is not None:
+        typer.echo(f"a smaller batch: {batch.reason}", err=True)
     if batch.strategy != batch.requested_strategy:
-        why = "no model family takes its spaces" if found.family is None else "no round has trained a model yet"
-        typer.echo(f"by {batch.strategy} and not by {batch.requested_strategy}: {why}", err=True)
-    typer.echo(f"acquisition {batch.id}, token {batch.token}: {len(batch.items)} segments by {batch.strategy}")
+        typer.echo(f"by {batch.strategy} and not by {batch.requested_strategy}: {_why(batch, found)}", err=True)
+    what = "states to explore from" if batch.mode == "explore" else "segments"
+    typer.echo(f"acquisition {batch.id}, token {batch.token}: {len(batch.items)} {what} by {batch.strategy}")
     typer.echo(f"labels are due by {batch.lease_expires_at:%Y-%m-%d %H:%M:%S %Z} through POST {url}/labels")
 
 
@@ -53,6 +61,7 @@ def label(
     project: ProjectName,
     *,
     count: Count = 100,
+    mode: Mode = "pool",
     strategy: Strategy = None,
     purpose: Purpose = "pool",
     acquisition: Annotated[str | None, typer.Option(help="Answer this one, taken elsewhere; needs --token.")] = None,
@@ -62,7 +71,7 @@ def label(
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:
-    """Acquire segments and answer them with the project's simulator."""
+    """Acquire segments, or explorations, and answer them with the project's simulator."""
     from asim.report import Report
     from asim.simulator_labeling import answer, given
 
@@ -73,8 +82,19 @@ def label(
         if acquisition is not None:
             batch = given(client, found, acquisition, token)
         else:
-            batch = client.acquire(found.id, count, strategy=strategy, purpose=purpose, labeler="asim label", wait=wait)
+            batch = client.acquire(
+                found.id, count, mode=mode, strategy=strategy, purpose=purpose, labeler="asim label", wait=wait
+            )
         answer(client, batch, seed, report)
+
+
+def _why(batch: "Acquisition", project: "Project") -> str:
+    """Why another strategy than the requested one gave the batch."""
+    if batch.mode == "explore":
+        return "explorations are drawn by chance, no model proposes any yet"
+    if batch.purpose == "held_out":
+        return "held-out segments are drawn by chance"
+    return "no model family takes its spaces" if project.family is None else "no round has trained a model yet"
 
 
 def start_round(project: ProjectName, url: Url = DEFAULT_URL, key: Key = None) -> None:

@@ -1,10 +1,13 @@
 """asim serve, asim worker, asim demo: the commands that start processes."""
 
 from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from asim.commands.console import Key
 
 if TYPE_CHECKING:
     from service.settings import Settings
@@ -42,11 +45,19 @@ def worker(
 def demo(
     seed: Annotated[int, typer.Option(min=0, envvar="SEED", help="Of data, labels and networks.")] = 0,
     keep: Annotated[Path | None, typer.Option(help="Keep the service's data in this folder.")] = None,
+    url: Annotated[
+        str | None, typer.Option(help="A service that runs already; without it the demo starts one of its own.")
+    ] = None,
+    key: Key = None,
 ) -> None:
     """Run the loop on MiniGrid with strategies cycle and random side by side, and compare their model errors."""
+    from asim.demo import Service
     from asim.demo import demo as run_demo
+    from asim.errors import AsimError
 
-    run_demo(seed, keep)
+    if url is not None and keep is not None:
+        raise AsimError(f"--keep {keep}: the service at --url {url} keeps its data itself; give one of the two")
+    run_demo(seed, keep, service=None if url is None else Service(url, key, f"demo-{datetime.now(UTC):%Y%m%d-%H%M%S}"))
 
 
 def settings_of(data: Path | None) -> "Settings":

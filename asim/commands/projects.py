@@ -1,7 +1,6 @@
 """asim project, asim collect, asim import: what is known of an environment, and its trajectories."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +12,7 @@ from asim.errors import AsimError
 if TYPE_CHECKING:
     from api_schemas.environments import Environment
 
-UPLOAD_BYTES = 32 * 2**20  # of one request, so that no upload meets the service's limit
+UPLOAD_FILES, UPLOAD_BYTES = 200, 32 * 2**20  # of one request, so that no upload meets the service's limit
 app = typer.Typer(no_args_is_help=True)
 RoundLabels = Annotated[int | None, typer.Option(min=0, help="New pool labels that start a round; 0: none does.")]
 LabelBudget = Annotated[int | None, typer.Option(min=1, help="Pool labels that may be spent in all.")]
@@ -144,19 +143,19 @@ def import_files(
     An npz file holds one array for each observation stream of the project, time first, T + 1 rows. With a further
     array `actions` of T rows it is a labeled trajectory: all its segments are labeled at once.
     """
+    from asim.batches import batches
     from asim.importing import add_labeled, has_actions
 
     with connect(url, key) as client:
         found = client.find_project(project)
         labeled = [path for path in files if has_actions(path)]
         plain = [path for path in files if path not in set(labeled)]
-        for batch in _batches(plain):
+        for batch in batches(plain, lambda path: path.stat().st_size, UPLOAD_FILES, UPLOAD_BYTES):
             for receipt in client.add_files(found.id, {str(path): path.read_bytes() for path in batch}, split).items:
                 place = f"{receipt.split}, {receipt.transitions} transitions"
                 typer.echo(f"{receipt.source}: {receipt.status} {receipt.id} ({place})")
-        for batch in _batches(labeled):
-            accepted = add_labeled(client, found.id, batch, split)
-            typer.echo(f"{len(batch)} labeled files: {accepted.created} labels, {accepted.duplicates} known before")
+        for sent, accepted in add_labeled(client, found.id, labeled, split):
+            typer.echo(f"{sent} labeled files: {accepted.created} labels, {accepted.duplicates} known before")
 
 
 def _environment(simulator: str | None, options: list[str], spaces: Path | None) -> "Environment":
@@ -175,17 +174,3 @@ def _option(text: str) -> tuple[str, str | int | float | bool]:
     except ValueError:  # a plain word, such as key_delivery
         return name, value
     return name, parsed if isinstance(parsed, int | float | bool) else value
-
-
-def _batches(paths: list[Path]) -> Iterator[list[Path]]:
-    """Groups of files that one request carries."""
-    batch: list[Path] = []
-    size = 0
-    for path in paths:
-        if batch and (size + path.stat().st_size > UPLOAD_BYTES or len(batch) == 200):
-            yield batch
-            batch, size = [], 0
-        batch.append(path)
-        size += path.stat().st_size
-    if batch:
-        yield batch

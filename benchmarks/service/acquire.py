@@ -1,59 +1,96 @@
-"""Latency of POST /acquire over HTTP: 16 segments a call, 200 calls, a ready queue, a pool of 28,000 segments.
+"""Latency of POST /acquire over HTTP: 16 segments a call, 200 calls, a ready queue, a pool of any size.
 
-The service is an `asim serve` of its own on SQLite; the client asks one call after another over one connection, so the
-figures are latencies without waiting for other clients. The queue is selected once, long enough for all calls.
+    python -m benchmarks.service.acquire                                      28,000 segments on SQLite
+    python -m benchmarks.service.acquire --pool 1000000 --database postgresql+psycopg://…
+
+The service is an `asim serve` of its own; the client asks one call after another over one connection, so the figures
+are latencies without waiting for other clients. The queue is selected once, long enough for all calls. --database is
+the URL of an empty database; without it the service keeps its own SQLite file.
 """
 
+import argparse
 import os
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from api_schemas.collections import CollectionCreate
-from api_schemas.environments import Environment
-from api_schemas.projects import LabelingPolicy, ProjectCreate
+from api_schemas.projects import Project
 from asim.client import Client
 from asim.served import served
 from benchmarks.figures import Figure, finish
+from benchmarks.service.filling import fill, project_of
 
-CALLS, COUNT, WARM_UP, TRANSITIONS = 200, 16, 5, 28_000
+CALLS, COUNT, WARM_UP = 200, 16, 5
+SMALL_POOL = 28_000
+TARGETS = {SMALL_POOL: 30.0}  # milliseconds; a larger pool has LARGE_TARGET
+LARGE_TARGET = 50.0
+QUEUE_SECONDS = 300.0
+ENVIRONMENT = {"ASIM_QUEUE_LENGTH": str((CALLS + WARM_UP) * COUNT)}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Seconds: of filling the pool, of the first queue, of each call."""
+
+    filling: float
+    ranking: float
+    calls: Sequence[float]
+
+    def figures(self, pool: int) -> list[Figure]:
+        """What is printed."""
+        milliseconds = np.array(self.calls) * 1000
+        target = TARGETS.get(pool, LARGE_TARGET)
+        return [
+            Figure("filling", pool / self.filling, "segments/s"),
+            Figure("first_queue", self.ranking, "s"),
+            Figure("acquire_p50", float(np.percentile(milliseconds, 50)), "ms"),
+            Figure("acquire_max", float(milliseconds.max()), "ms"),
+            Figure("acquire_p99", float(np.percentile(milliseconds, 99)), "ms", target, "below"),
+        ]
 
 
 def main() -> None:
     """Run and print."""
-    os.environ["ASIM_QUEUE_LENGTH"] = str((CALLS + WARM_UP) * COUNT)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--pool", type=int, default=SMALL_POOL, help="segments")
+    parser.add_argument("--transitions", type=int, default=50, help="of each trajectory")
+    parser.add_argument("--database", default="", help="URL of an empty database; default a SQLite file")
+    asked = parser.parse_args()
+    os.environ |= ENVIRONMENT | {"ASIM_DATABASE_URL": asked.database}
     with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as url, Client(url) as client:
-        seconds = _latencies(client)
-    milliseconds = np.array(seconds) * 1000
-    print(f"{CALLS} calls of POST /acquire, {COUNT} segments each, a pool of {TRANSITIONS} segments, SQLite, HTTP")
-    finish(
-        [
-            Figure("acquire_p50", float(np.percentile(milliseconds, 50)), "ms"),
-            Figure("acquire_max", float(milliseconds.max()), "ms"),
-            Figure("acquire_p99", float(np.percentile(milliseconds, 99)), "ms", 30.0, "below"),
-        ]
-    )
+        measured = measure(client, asked.pool, asked.transitions)
+    kind = asked.database.partition(":")[0] or "sqlite"
+    print(f"{CALLS} calls of POST /acquire, {COUNT} segments each, a pool of {asked.pool} segments, {kind}, HTTP")
+    finish(measured.figures(asked.pool))
 
 
-def _latencies(client: Client) -> list[float]:
-    """Seconds of each call; the pool's order is random, which needs no round and takes the same path as any other."""
-    policy = LabelingPolicy(strategy="random", round_labels=0)
-    project = client.create_project(
-        ProjectCreate(name="bench", environment=Environment(simulator="minigrid"), policy=policy)
-    )
-    job = client.collect(CollectionCreate(project=project.id, transitions=TRANSITIONS, split="pool"))
-    client.wait_for_job(job.id)
-    for _ in range(WARM_UP):  # the first call waits for the queue
-        client.acquire(project.id, COUNT)
-    seconds = []
-    for _ in range(CALLS):
-        began = time.perf_counter()
-        batch = client.acquire(project.id, COUNT, wait=0)
-        seconds.append(time.perf_counter() - began)
-        if len(batch.items) != COUNT:
-            raise RuntimeError(f"asked for {COUNT} segments, got {len(batch.items)}")
+def measure(client: Client, pool: int, transitions: int = 50) -> Measured:
+    """Fill a pool and acquire from it."""
+    project = project_of(client, "bench")
+    began = time.perf_counter()
+    fill(client, project, pool, transitions)
+    filled = time.perf_counter()
+    client.acquire(project.id, COUNT, wait=QUEUE_SECONDS)  # the first call waits for the queue
+    ranked = time.perf_counter()
+    for _ in range(WARM_UP - 1):
+        client.acquire(project.id, COUNT, wait=0)
+    calls = [_call(client, project) for _ in range(CALLS)]
+    given = client.project(project.id).counts
+    if (given.pool_segments, given.leased) != (pool, (CALLS + WARM_UP) * COUNT):
+        raise RuntimeError(f"a pool of {pool} segments was asked for and {(CALLS + WARM_UP) * COUNT} leased: {given}")
+    return Measured(filled - began, ranked - filled, calls)
+
+
+def _call(client: Client, project: Project) -> float:
+    began = time.perf_counter()
+    batch = client.acquire(project.id, COUNT, wait=0)
+    seconds = time.perf_counter() - began
+    if len(batch.items) != COUNT:
+        raise RuntimeError(f"asked for {COUNT} segments, got {len(batch.items)}")
     return seconds
 
 

@@ -1,17 +1,22 @@
 """/acquire and /acquisitions."""
 
+import time
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Response
-from fastapi.responses import JSONResponse
+import anyio
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.concurrency import run_in_threadpool
 
 from api_schemas.acquisitions import AcquireRequest, Acquisition, AcquisitionPending, ExtendRequest, ReleaseRequest
-from service import acquisitions
-from service.api.dependencies import Now, ReadSession, ServicesDep, WriteSession, requires
+from service import acquisitions, jobs, leases
+from service.api.dependencies import Now, ReadSession, Services, ServicesDep, WriteSession, requires
+from service.api.once import Answer, IdempotencyKey, Prefer, answered_once, key_use, wait_seconds
+from service.idempotency import KeyUse
 from service.store.tables import JobRow
 
 router = APIRouter(tags=["acquisitions"])
 reader, acquirer = Depends(requires("read")), Depends(requires("acquire"))
+POLL_SECONDS = 0.1
 
 
 @router.post(
@@ -21,35 +26,64 @@ reader, acquirer = Depends(requires("read")), Depends(requires("acquire"))
     responses={202: {"model": AcquisitionPending}},
     dependencies=[acquirer],
 )
-def acquire(
-    request: AcquireRequest, session: WriteSession, held: ServicesDep, now: Now, response: Response
-) -> Acquisition | JSONResponse:
-    given = acquisitions.acquire(session, request, now, held.limits)
-    if isinstance(given, JobRow):
-        return _pending(given)
-    response.headers["Location"] = f"/acquisitions/{given.id}"
-    return acquisitions.describe(session, given, now, with_token=True)
+async def acquire(
+    request: AcquireRequest,
+    held: ServicesDep,
+    http: Request,
+    idempotency_key: IdempotencyKey = None,
+    prefer: Prefer = None,
+) -> Response:
+    use, deadline = key_use(http, idempotency_key, request), time.monotonic() + wait_seconds(prefer)
+    answer = await run_in_threadpool(_acquired, held, request, use)
+    while answer.status == 202 and time.monotonic() < deadline:  # no thread and no transaction is held meanwhile
+        await anyio.sleep(POLL_SECONDS)
+        if await run_in_threadpool(_is_over, held, AcquisitionPending.model_validate_json(answer.body).job):
+            answer = await run_in_threadpool(_acquired, held, request, use)
+    response = answer.response()
+    if wait_seconds(prefer):
+        response.headers["Preference-Applied"] = f"wait={wait_seconds(prefer):.0f}"
+    return response
 
 
 @router.get("/acquisitions/{acquisition_id}", dependencies=[reader])
 def show_acquisition(acquisition_id: UUID, session: ReadSession, now: Now) -> Acquisition:
-    row = acquisitions.find(session, acquisition_id)
+    row = leases.find(session, acquisition_id)
     return acquisitions.describe(session, row, now, with_token=False)
 
 
 @router.post("/acquisitions/{acquisition_id}/extend", dependencies=[acquirer])
 def extend(acquisition_id: UUID, request: ExtendRequest, session: WriteSession, now: Now) -> Acquisition:
-    row = acquisitions.extend(session, acquisition_id, request.token, request.lease_seconds, now)
+    row = leases.extend(session, acquisition_id, request.token, request.lease_seconds, now)
     return acquisitions.describe(session, row, now, with_token=True)
 
 
 @router.post("/acquisitions/{acquisition_id}/release", dependencies=[acquirer])
 def release(acquisition_id: UUID, request: ReleaseRequest, session: WriteSession, now: Now) -> Acquisition:
-    row = acquisitions.release(session, acquisition_id, request.token, now)
+    row = leases.release(session, acquisition_id, request.token, now)
     return acquisitions.describe(session, row, now, with_token=False)
 
 
-def _pending(job: JobRow) -> JSONResponse:
+def _acquired(held: Services, request: AcquireRequest, use: KeyUse | None) -> Answer:
+    """One attempt in a transaction of its own."""
+    with held.database.write() as session:
+        now = held.clock()
+
+        def rule() -> Answer:
+            given = acquisitions.acquire(session, request, now, held.limits)
+            if isinstance(given, JobRow):
+                return _pending(given)
+            body = acquisitions.describe(session, given, now, with_token=True)
+            return Answer(201, body.model_dump_json(), f"/acquisitions/{given.id}")
+
+        return answered_once(session, use, held.settings, now, rule)
+
+
+def _pending(job: JobRow) -> Answer:
     detail = f"no ranked queue is ready yet; job {job.id} ({job.kind}) is {job.state}"
     body = AcquisitionPending(detail=detail, job=job.id)
-    return JSONResponse(body.model_dump(mode="json"), 202, {"Location": f"/jobs/{job.id}", "Retry-After": "1"})
+    return Answer(202, body.model_dump_json(), f"/jobs/{job.id}", {"Retry-After": "1"})
+
+
+def _is_over(held: Services, job_id: UUID) -> bool:
+    with held.database.read() as session:
+        return jobs.find(session, job_id).finished_at is not None

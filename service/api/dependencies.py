@@ -12,7 +12,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from sqlalchemy.orm import Session
 
 from api_schemas.keys import Key, Scope
-from service import keys
+from service import keys, origin
 from service.errors import NotAllowed, Unauthenticated
 from service.scorings import Limits, limits_of
 from service.settings import Settings
@@ -35,6 +35,9 @@ class Services:
     def limits(self) -> Limits:
         """Bounds of scorings."""
         return limits_of(self.settings)
+
+
+LOCAL = "local"  # who asks without a key, in embedded mode
 
 
 # What only hands something on is `async`: a plain function would cost a trip through the thread pool each.
@@ -79,13 +82,21 @@ def requires(scope: Scope) -> Callable[[Request, Services, Credentials], Awaitab
     async def check(request: Request, held: ServicesDep, credentials: Credentials) -> None:
         if credentials is None:
             if held.settings.embedded and _is_loopback(request):
+                _name_caller(request, LOCAL, LOCAL)
                 return
             raise Unauthenticated("authorization: send an API key as `Authorization: Bearer KEY`")
         key = await run_in_threadpool(_verified, held, credentials.credentials)
         if scope not in key.scopes and "admin" not in key.scopes:
             raise NotAllowed(f"authorization: this needs the scope {scope!r}, the key has {', '.join(key.scopes)}")
+        _name_caller(request, str(key.id), f"key {key.id} {key.name}")
 
     return check
+
+
+def _name_caller(request: Request, caller: str, actor: str) -> None:
+    """Who this is, for idempotency keys, which are each caller's own, and for events and logs."""
+    request.state.caller = caller
+    origin.bind_actor(actor[:200])
 
 
 def _verified(held: Services, secret: str) -> Key:

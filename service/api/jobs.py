@@ -8,8 +8,9 @@ from fastapi import APIRouter, Depends, Query
 from api_schemas.base import Page
 from api_schemas.events import Event
 from api_schemas.jobs import Job
-from service import events, jobs, projects
-from service.api.dependencies import Cursor, PageSize, ReadSession, requires
+from service import cancellation, events, jobs, projects
+from service.api.dependencies import Cursor, Now, PageSize, ReadSession, WriteSession, requires
+from service.store.queries.events import settled
 from service.store.queries.listing import page
 from service.store.tables import EventRow, JobRow
 
@@ -36,9 +37,15 @@ def show_job(job_id: UUID, session: ReadSession) -> Job:
     return jobs.describe(jobs.find(session, job_id))
 
 
+@router.delete("/jobs/{job_id}", dependencies=[Depends(requires("admin"))])
+def cancel_job(job_id: UUID, session: WriteSession, now: Now) -> Job:
+    return jobs.describe(cancellation.cancel(session, job_id, now))
+
+
 @router.get("/events")
 def list_events(
     session: ReadSession,
+    now: Now,
     project: UUID | None = None,
     newest: Annotated[bool, Query(description="newest first")] = False,
     cursor: Cursor = None,
@@ -46,6 +53,7 @@ def list_events(
 ) -> Page[Event]:
     if project is not None:
         projects.find(session, project)
-    where = [] if project is None else [EventRow.project_id == project]
+    where = [] if newest else [settled(now)]
+    where += [] if project is None else [EventRow.project_id == project]
     rows, after = page(session, EventRow, where, (EventRow.id,), cursor, limit, newest_first=newest)
     return Page(items=[events.describe(row) for row in rows], next=after)

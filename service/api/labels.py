@@ -2,7 +2,7 @@
 
 from uuid import UUID
 
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter, Depends, Request, Response
 
 from api_schemas.base import Page
 from api_schemas.environments import Spaces
@@ -10,6 +10,7 @@ from api_schemas.labels import Label, LabelsAccepted, LabelsRequest
 from service import labels, pool, projects
 from service.actions import check_actions
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep, requires
+from service.api.once import Answer, IdempotencyKey, answered_once, key_use
 from service.errors import InvalidField
 from service.labels import LabeledUpload
 from service.store import npz
@@ -20,15 +21,21 @@ router = APIRouter(prefix="/labels", tags=["labels"])
 reader, labeler = Depends(requires("read")), Depends(requires("label"))
 
 
-@router.post("", status_code=201, dependencies=[labeler])
-def add_labels(request: LabelsRequest, held: ServicesDep, now: Now) -> LabelsAccepted:
+@router.post("", status_code=201, response_model=LabelsAccepted, dependencies=[labeler])
+def add_labels(
+    request: LabelsRequest, held: ServicesDep, now: Now, http: Request, idempotency_key: IdempotencyKey = None
+) -> Response:
     if not request.items and not request.trajectories:
         raise InvalidField("items", [], "must hold a label, or trajectories a labeled trajectory")
-    with held.database.read() as session:
-        spaces = projects.spaces_of(projects.find(session, request.project))
-    uploads = _store_trajectories(held, spaces, request)
+    use, uploads = key_use(http, idempotency_key, request), _store_trajectories(held, request)
     with held.database.write() as session:
-        return labels.accept(session, request, uploads, now, held.settings.job_max_attempts)
+
+        def rule() -> Answer:
+            accepted = labels.accept(session, request, uploads, now, held.settings.job_max_attempts)
+            return Answer(201, accepted.model_dump_json())
+
+        answer = answered_once(session, use, held.settings, now, rule)
+    return answer.response()
 
 
 @router.get("", dependencies=[reader])
@@ -38,7 +45,12 @@ def list_labels(project: UUID, session: ReadSession, cursor: Cursor = None, limi
     return Page(items=[labels.describe(row) for row in rows], next=after)
 
 
-def _store_trajectories(held: Services, spaces: Spaces, request: LabelsRequest) -> list[LabeledUpload]:
+def _store_trajectories(held: Services, request: LabelsRequest) -> list[LabeledUpload]:
+    """Blobs first, outside the transaction: they are named by content, so a crash before the rows does no harm."""
+    if not request.trajectories:
+        return []
+    with held.database.read() as session:
+        spaces: Spaces = projects.spaces_of(projects.find(session, request.project))
     uploads = []
     for position, trajectory in enumerate(request.trajectories):
         name = f"trajectories[{position}]"
@@ -46,6 +58,13 @@ def _store_trajectories(held: Services, spaces: Spaces, request: LabelsRequest) 
         check_actions(spaces, trajectory.actions, trajectory.action_sets, name)
         stored = pool.store(held.blobs, spaces, arrays, name)
         uploads.append(
-            LabeledUpload(stored, trajectory.actions, trajectory.action_sets, trajectory.starts, trajectory.split)
+            LabeledUpload(
+                stored,
+                trajectory.actions,
+                trajectory.action_sets,
+                trajectory.starts,
+                trajectory.split,
+                rank=trajectory.rank,
+            )
         )
     return uploads

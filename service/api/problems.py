@@ -5,7 +5,8 @@ from http import HTTPStatus
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from sqlalchemy.exc import DataError, OperationalError
+from obstore.exceptions import BaseError
+from sqlalchemy.exc import DataError, InterfaceError, OperationalError, TimeoutError  # noqa: A004  (of the pool)
 from starlette.exceptions import HTTPException
 
 from api_schemas.errors import PROBLEM_JSON, InvalidParam, Problem
@@ -21,7 +22,9 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _malformed)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(DataError, _unstorable)
-    app.add_exception_handler(OperationalError, _database_error)
+    for unavailable in (OperationalError, InterfaceError, TimeoutError):
+        app.add_exception_handler(unavailable, _database_error)
+    app.add_exception_handler(BaseError, _storage_error)
     app.add_exception_handler(Exception, _unexpected)
 
 
@@ -74,6 +77,14 @@ def _database_error(request: Request, error: Exception) -> JSONResponse:
     detail = "the database did not answer in time; nothing was stored, try again"
     return answer(
         _problem("database-unavailable", 503, "The database is unavailable", detail, request), {"Retry-After": "1"}
+    )
+
+
+def _storage_error(request: Request, error: Exception) -> JSONResponse:
+    log.error("storage_error", path=request.url.path, error=str(error))
+    detail = "the blob store could not be read or written; nothing was stored, try again"
+    return answer(
+        _problem("storage-unavailable", 503, "The blob store is unavailable", detail, request), {"Retry-After": "5"}
     )
 
 

@@ -1,15 +1,22 @@
-"""What a browser may do: only pages of this service's own host, and only this host's names."""
+"""Before any handler: what a browser may do, how large a body may be, and which request this is.
 
+Browsers may use pages of this service's own host only, under this host's names only.
+"""
+
+import re
 from http import HTTPStatus
+from uuid import uuid4
 
 from fastapi import FastAPI, HTTPException, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service import origin
 from service.api import problems
 from service.errors import BodyTooLarge, CrossOrigin, ServiceError
 from service.settings import Settings
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+CORRELATION = "X-Correlation-ID"
 
 
 def install(app: FastAPI, settings: Settings) -> None:
@@ -28,14 +35,43 @@ class Guard:
             await self._app(scope, receive, send)
             return
         request = Request(scope)
+        correlation = _correlation(request)
+        with origin.bound(actor="", correlation=correlation):
+            await self._guarded(request, receive, _naming(send, correlation))
+
+    async def _guarded(self, request: Request, receive: Receive, send: Send) -> None:
+        limit = _largest_body(request, self._settings)
         try:
             _check_host(request, self._settings)
             _check_origin(request)
-            _check_size(request, self._settings.max_body_bytes)
+            _check_size(request, limit)
         except ServiceError as error:
-            await problems.answer(error.problem(request.url.path))(scope, receive, send)
+            await problems.answer(error.problem(request.url.path))(request.scope, receive, send)
         else:
-            await self._app(scope, _bounded(receive, self._settings.max_body_bytes), send)
+            await self._app(request.scope, _bounded(receive, limit), send)
+
+
+def _correlation(request: Request) -> str:
+    """The id that the client gave the request, where it can stand in a log line; else one of our own."""
+    given = request.headers.get(CORRELATION, "")
+    return given if re.fullmatch(r"[A-Za-z0-9._:@-]{1,100}", given) else uuid4().hex
+
+
+def _naming(send: Send, correlation: str) -> Send:
+    """Every answer says by which id logs and events know its request."""
+
+    async def named(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            message["headers"] = [*message.get("headers", []), (CORRELATION.lower().encode(), correlation.encode())]
+        await send(message)
+
+    return named
+
+
+def _largest_body(request: Request, settings: Settings) -> int:
+    if request.method == "POST" and request.url.path == "/labels":
+        return min(settings.max_labels_bytes, settings.max_body_bytes)
+    return settings.max_body_bytes
 
 
 def _check_host(request: Request, settings: Settings) -> None:

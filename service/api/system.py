@@ -1,5 +1,6 @@
 """/strategies, /keys, /health and /metrics."""
 
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from importlib.metadata import version
 from uuid import UUID
@@ -12,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from api_schemas.keys import Health, KeyCreate, KeyCreated
 from api_schemas.strategies import CATALOG, Strategy
-from service import keys, projects, rounds
+from service import canary, keys, projects, rounds
 from service.api.dependencies import Now, ReadSession, Services, ServicesDep, WriteSession, requires
 from service.log import get_logger
 from service.store.queries import jobs as job_queries
@@ -53,14 +54,15 @@ def live() -> dict[str, str]:
 
 @router.get("/health/ready", response_model=Health, responses={503: {"model": Health}})
 def ready(held: ServicesDep, now: Now) -> JSONResponse:
-    database, workers = _database_state(held, now - WORKER_SILENCE)
+    work = _work_state(held, now)
     blobs = held.blobs.reachable()
-    healthy = database and blobs and workers > 0
+    healthy = blobs and work is not None and work.served
     body = Health(
         status="ok" if healthy else "unavailable",
-        database=database,
+        database=work is not None,
         blobs=blobs,
-        workers_alive=workers,
+        workers_alive=work.workers if work else 0,
+        canaries=work.canaries if work else dict.fromkeys(canary.QUEUES),
         version=version("asim"),
     )
     return JSONResponse(body.model_dump(), 200 if healthy else 503)
@@ -71,14 +73,27 @@ def metrics(session: ReadSession, now: Now) -> Response:
     return Response(generate_latest(_gauges(session, now)), media_type=CONTENT_TYPE_LATEST)
 
 
-def _database_state(held: Services, since: datetime) -> tuple[bool, int]:
-    """Whether the database answers, and how many workers it has heard of since then."""
+@dataclass(frozen=True)
+class _WorkState:
+    """Workers heard of lately, the canaries' ages, and whether every queue is served."""
+
+    workers: int
+    canaries: dict[str, float | None]
+    served: bool
+
+
+def _work_state(held: Services, now: datetime) -> _WorkState | None:
+    """What the database says of the work; None where it does not answer."""
     try:
         with held.database.read() as session:
-            return True, job_queries.live_workers(session, since)
+            return _WorkState(
+                job_queries.live_workers(session, now - WORKER_SILENCE),
+                canary.ages(session, now),
+                all(canary.healthy(session, now, held.settings.canary_seconds).values()),
+            )
     except SQLAlchemyError as error:
         log.warning("database_unreachable", error=str(error))
-        return False, 0
+        return None
 
 
 def _gauges(session: Session, now: datetime) -> CollectorRegistry:

@@ -36,6 +36,7 @@ def add_trajectories(
     parsed = [(file.filename or "file", npz.parse(file.file.read(), file.filename or "file", limit)) for file in files]
     stored = [pool.store(held.blobs, spaces, arrays, name) for name, arrays in parsed]
     with held.database.write() as session:
+        pool.keep(session, stored, now)
         row = projects.find(session, project, lock=True)
         return TrajectoriesAdded(items=[pool.add(session, row, item, split, now) for item in stored])
 

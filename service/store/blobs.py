@@ -2,18 +2,39 @@
 
 This store holds observations, weights, scores and checkpoints. What may not be seen in training is in another, with a
 root of its own: service.store.provenance.
+
+An S3 store takes endpoint, region and credentials from the AWS_* variables that every S3 program reads (README,
+Settings), so that keys are in no URL and no log.
 """
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, MemoryStore, S3Store, from_url
 
-from service.errors import CorruptBlob, MissingBlob
+from service.errors import CorruptBlob, MissingBlob, ServiceError
 from service.log import get_logger
 
+if TYPE_CHECKING:
+    from obstore.store import RetryConfig
+
 log = get_logger("store")
+# obstore's own would keep a request waiting for three minutes; here who asks is told soon, and asks again.
+RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=10)}
+
+
+class BlobsUnavailable(ServiceError):
+    """The blob store is unavailable."""
+
+    status_code = 503
+
+    def __init__(self, key: str, reason: str) -> None:
+        super().__init__(f"blob {key}: its store did not do what was asked; nothing was stored, try again: {reason}")
 
 
 class Blobs:
@@ -25,25 +46,45 @@ class Blobs:
         self._store = _open_store(url)
 
     def put(self, kind: str, data: bytes) -> str:
-        """Store `data`, once; returns its sha256. Putting the same bytes again changes nothing."""
+        """Store `data`, once; returns its sha256. Putting the same bytes again changes nothing.
+
+        Raises BlobsUnavailable.
+        """
         sha256 = hashlib.sha256(data).hexdigest()
-        try:
-            self._store.put(self._key(kind, sha256), data, mode="create")
-        except AlreadyExistsError:
-            self._mend(kind, sha256, data)
+        key = self._key(kind, sha256)
+        with _reached(key):
+            try:
+                self._store.put(key, data, mode="create")
+            except AlreadyExistsError:
+                self._mend(kind, sha256, data)
+            except NotImplementedError:  # AWS_CONDITIONAL_PUT=disabled: the same bytes over the same bytes do no harm
+                self._store.put(key, data, mode="overwrite")
         return sha256
 
     def get(self, kind: str, sha256: str) -> bytes:
-        """The bytes, checked. Raises MissingBlob and CorruptBlob."""
+        """The bytes, checked. Raises MissingBlob, CorruptBlob and BlobsUnavailable."""
         key = self._key(kind, sha256)
-        try:
-            data = bytes(self._store.get(key).bytes())
-        except FileNotFoundError as error:
-            raise MissingBlob(key) from error
+        with _reached(key):
+            try:
+                data = bytes(self._store.get(key).bytes())
+            except FileNotFoundError as error:
+                raise MissingBlob(key) from error
         found = hashlib.sha256(data).hexdigest()
         if found != sha256:
             raise CorruptBlob(key, sha256, found)
         return data
+
+    def delete(self, kind: str, sha256: str) -> None:
+        """Remove the blob. One that is gone already is no error: whoever removes it may be asked to do so again.
+
+        Raises BlobsUnavailable.
+        """
+        key = self._key(kind, sha256)
+        with _reached(key):
+            try:
+                self._store.delete(key)
+            except FileNotFoundError:  # a folder says so, S3 does not
+                return
 
     def reachable(self) -> bool:
         """True where the store answers a listing."""
@@ -52,7 +93,7 @@ class Blobs:
         try:
             next(iter(self._store.list(chunk_size=1)), None)
         except (BaseError, OSError) as error:
-            log.warning("blobs_unreachable", error=str(error))
+            log.warning("blobs_unreachable", error=_sentence(error))
             return False
         return True
 
@@ -60,7 +101,7 @@ class Blobs:
         """An object of this name may be torn (a crash of an older store, a bad disk): write it again if it is."""
         try:
             self.get(kind, sha256)
-        except CorruptBlob:
+        except (CorruptBlob, MissingBlob):  # missing: somebody deleted it just now
             self._store.put(self._key(kind, sha256), data, mode="overwrite")
 
     def _key(self, kind: str, sha256: str) -> str:
@@ -69,11 +110,28 @@ class Blobs:
         return f"{kind}/{sha256[:2]}/{sha256}"
 
 
+@contextmanager
+def _reached(key: str) -> Iterator[None]:
+    """Whatever keeps the store from answering (network, credentials, a full disk, no bucket) is one kind of error."""
+    try:
+        yield
+    except (BaseError, OSError) as error:
+        log.warning("blobs_unavailable", key=key, error=_sentence(error))
+        raise BlobsUnavailable(key, _sentence(error)) from error
+
+
+def _sentence(error: Exception) -> str:
+    """obstore's first line; below it are its data structures."""
+    return str(error).partition("\n")[0][:500]
+
+
 def _open_store(url: str) -> LocalStore | S3Store | MemoryStore:
+    if url.startswith("s3://"):
+        return S3Store.from_url(url, retry_config=RETRIES)  # client_options would hide AWS_ALLOW_HTTP and the like
     if "://" not in url:
         Path(url).mkdir(parents=True, exist_ok=True)
         return LocalStore(prefix=url)
-    store = from_url(url) if url.startswith(("s3://", "file://", "memory://")) else None
-    if not isinstance(store, LocalStore | S3Store | MemoryStore):
+    store = from_url(url) if url.startswith(("file://", "memory://")) else None
+    if not isinstance(store, LocalStore | MemoryStore):
         raise ValueError(f"blobs_url: {url!r} is neither a folder nor s3://")
     return store

@@ -40,10 +40,13 @@ class Database:
 
 def open_database(url: str) -> Database:
     """Open, without migrating. Threads may share it; processes open their own."""
-    engine = create_engine(url, pool_size=48, max_overflow=0, pool_pre_ping=not url.startswith("sqlite"))
+    server = {} if url.startswith("sqlite") else {"pool_pre_ping": True, "connect_args": {"connect_timeout": 5}}
+    engine = create_engine(url, pool_size=48, max_overflow=0, **server)
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _configure_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
+    elif engine.dialect.name == "postgresql":
+        event.listen(engine, "connect", _configure_postgresql)
     write_engine = engine.execution_options(asim_write=True)
     return Database(
         engine,
@@ -67,6 +70,15 @@ def _configure_sqlite(connection: DBAPIConnection, _: ConnectionPoolEntry) -> No
     connection.isolation_level = None  # SQLAlchemy's begin event below says BEGIN, not the driver
     for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "busy_timeout=15000"):
         connection.execute(f"PRAGMA {pragma}")
+
+
+def _configure_postgresql(connection: DBAPIConnection, _: ConnectionPoolEntry) -> None:
+    """Nobody waits for ever: for a row that another holds, or because a frozen process sits on an open transaction."""
+    autocommit = connection.autocommit
+    connection.autocommit = True  # else the pool's first rollback takes the settings back
+    for name, milliseconds in (("lock_timeout", 15_000), ("idle_in_transaction_session_timeout", 30_000)):
+        connection.cursor().execute(f"SET {name} = {milliseconds}")
+    connection.autocommit = autocommit
 
 
 def _begin_sqlite(connection: Connection) -> None:

@@ -157,6 +157,7 @@ class AcquisitionRow(Row):
     token: Mapped[int]
     lease_expires_at: Mapped[datetime]
     created_at: Mapped[datetime]
+    __table_args__ = (Index("ix_acquisition_expiry", "status", "lease_expires_at"),)
 
 
 class AcquisitionItemRow(Row):

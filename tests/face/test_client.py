@@ -56,15 +56,31 @@ def job(state: str, **more: object) -> dict[str, object]:
 
 def acquisition() -> dict[str, object]:
     return {
-        "id": str(uuid4()), "project": str(PROJECT), "purpose": "pool", "strategy": "random",
-        "requested_strategy": "random", "round": None, "status": "leased", "labeler": "", "token": 3,
+        "id": str(uuid4()), "project": str(PROJECT), "mode": "pool", "purpose": "pool", "strategy": "random",
+        "requested_strategy": "random", "round": None, "status": "leased", "reason": None, "labeler": "", "token": 3,
         "lease_expires_at": "2026-01-01T00:00:00Z", "created_at": "2026-01-01T00:00:00Z", "items": [],
         "budget": {"total": None, "spent": 0, "reserved": 0, "remaining": None},
     }  # fmt: skip
 
 
-def pending() -> httpx.Response:
-    return httpx.Response(202, json={"detail": "no ranked queue yet", "job": str(UUID(int=1))})
+def pending(of: int = 1, headers: dict[str, str] | None = None) -> httpx.Response:
+    return httpx.Response(202, json={"detail": "no ranked queue yet", "job": str(UUID(int=of))}, headers=headers)
+
+
+HELD = {"Preference-Applied": "wait=20"}
+ACCEPTED = {"receipts": [], "created": 0, "duplicates": 0, "watermark": 0, "round": None}
+ROUND = {
+    "id": str(UUID(int=5)), "project": str(PROJECT), "number": 2, "watermark": 9, "labels": 9, "stages": [],
+    "models": {}, "model_error": None, "job": None, "error": None, "created_at": "2026-01-01T00:00:00Z",
+    "finished_at": None,
+}  # fmt: skip
+
+
+def event(identity: int) -> dict[str, object]:
+    return {
+        "id": identity, "project": str(PROJECT), "kind": "labels.accepted", "data": {}, "actor": "local",
+        "correlation": "c", "created_at": "2026-01-01T00:00:00Z",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("failure", [httpx.ReadError("broken"), problem(503), problem(429)])
@@ -104,6 +120,38 @@ def test_a_post_that_found_no_connection_is_sent_again() -> None:
     assert script.transport([]).request("POST", "/x").status_code == 201
 
 
+@pytest.mark.parametrize("failure", [httpx.ReadError("broken"), httpx.ReadTimeout("slow"), problem(502), problem(429)])
+def test_labels_are_sent_again_under_the_same_key_until_they_are_answered(
+    failure: httpx.Response | Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("asim.transport.LONGEST_PAUSE", 0.0)
+    script = Script(failure, failure, httpx.Response(201, json=ACCEPTED))
+    assert script.client().label(LabelsRequest(project=PROJECT)).created == 0
+    keys = [request.headers["Idempotency-Key"] for request in script.requests]
+    assert len(keys) == 3
+    assert UUID(keys[0]).version == 4
+    assert set(keys) == {keys[0]}
+    assert len({request.content for request in script.requests}) == 1
+
+
+def test_each_call_has_a_key_of_its_own_unless_it_is_given_one() -> None:
+    script = Script(httpx.Response(201, json=ACCEPTED))
+    client = script.client()
+    for given in (None, None, "mine"):
+        client.label(LabelsRequest(project=PROJECT), idempotency_key=given)
+    first, second, mine = (request.headers["Idempotency-Key"] for request in script.requests)
+    assert first != second
+    assert mine == "mine"
+
+
+def test_other_posts_carry_no_key_and_are_not_sent_again() -> None:
+    script = Script(httpx.ReadError("broken"))
+    with pytest.raises(asim.Unreachable):
+        script.client().start_round(PROJECT)
+    assert len(script.requests) == 1
+    assert "Idempotency-Key" not in script.requests[0].headers
+
+
 @pytest.mark.parametrize(
     ("status", "error"),
     [
@@ -138,19 +186,51 @@ def test_all_pages_are_read_once_each() -> None:
     assert {request.url.params["project"] for request in script.requests} == {str(PROJECT)}
 
 
-def test_acquire_waits_for_the_job_that_ranks_and_asks_again() -> None:
+def test_acquire_has_the_service_wait_and_asks_again_under_the_same_key() -> None:
     script = Script(
-        pending(), httpx.Response(200, json=job("running")), httpx.Response(200, json=job("done")),
-        httpx.Response(201, json=acquisition()),
-    )  # fmt: skip
-    assert script.client().acquire(PROJECT, 4).token == 3
+        pending(), pending(1, HELD), httpx.Response(200, json=job("running")), httpx.Response(201, json=acquisition())
+    )
+    assert script.client().acquire(PROJECT, 4, mode="explore", idempotency_key="k").token == 3
     asked = [f"{request.method} {request.url.path}" for request in script.requests]
-    assert asked == ["POST /acquire", *["GET /jobs/00000000-0000-0000-0000-000000000001"] * 2, "POST /acquire"]
+    job_path = "GET /jobs/00000000-0000-0000-0000-000000000001"
+    assert asked == ["POST /acquire", "POST /acquire", job_path, "POST /acquire"]
+    posts = [request for request in script.requests if request.method == "POST"]
+    assert [request.headers.get("Prefer") for request in posts] == [None, "wait=20", "wait=20"]
+    assert {request.headers["Idempotency-Key"] for request in posts} == {"k"}
+    assert {json.loads(request.content)["mode"] for request in posts} == {"explore"}
+
+
+@pytest.mark.parametrize(
+    ("timeout", "wait", "held"), [(10.0, 60.0, "wait=5"), (60.0, 7.9, "wait=7"), (1.0, 60.0, None)]
+)
+def test_acquire_never_asks_for_a_longer_hold_than_the_wait_or_the_timeout_bear(
+    timeout: float, wait: float, held: str | None
+) -> None:
+    script = Script(pending(), httpx.Response(201, json=acquisition()))
+    Client("http://service", timeout=timeout, transport=httpx.MockTransport(script)).acquire(PROJECT, 4, wait=wait)
+    assert script.requests[1].headers.get("Prefer") == held
 
 
 def test_acquire_says_so_when_the_wait_is_over() -> None:
+    script = Script(pending())
     with pytest.raises(asim.NotReady, match="no ranked queue yet"):
-        Script(pending()).client().acquire(PROJECT, 4, wait=0)
+        script.client().acquire(PROJECT, 4, wait=0)
+    assert len(script.requests) == 1
+
+
+@pytest.mark.parametrize(
+    ("state", "error", "sentence"),
+    [("failed", asim.JobFailed, "failed: nan"), ("cancelled", asim.JobCancelled, "was cancelled before it was done")],
+)
+def test_acquire_raises_the_end_of_the_job_that_it_waited_for(
+    state: str, error: type[asim.JobFailed], sentence: str
+) -> None:
+    """By then the service has begun another job: that one is not waited for."""
+    ended = job(state, error="nan" if state == "failed" else None)
+    script = Script(pending(), pending(2, HELD), httpx.Response(200, json=ended))
+    with pytest.raises(error, match=rf"job {UUID(int=1)} \(score_shard\) {sentence}") as raised:
+        script.client().acquire(PROJECT, 4)
+    assert type(raised.value) is error
 
 
 def test_a_failed_job_is_raised_with_its_reason() -> None:
@@ -158,6 +238,41 @@ def test_a_failed_job_is_raised_with_its_reason() -> None:
     with pytest.raises(asim.JobFailed, match="segment 12 is not finite") as raised:
         script.client().wait_for_job(UUID(int=1))
     assert raised.value.job.state == "failed"
+
+
+def test_a_cancelled_job_and_a_cancelled_round_are_raised_as_such() -> None:
+    with pytest.raises(asim.JobCancelled, match="was cancelled before it was done"):
+        Script(httpx.Response(200, json=job("cancelled"))).client().wait_for_job(UUID(int=1))
+    cancelled = httpx.Response(200, json=ROUND | {"status": "cancelled"})
+    with pytest.raises(asim.RoundCancelled, match=r"round 2 \(.*\) was cancelled before it was current") as raised:
+        Script(cancelled).client().wait_for_round(UUID(int=5))
+    assert isinstance(raised.value, asim.RoundFailed)
+
+
+def test_a_job_is_cancelled_by_delete() -> None:
+    script = Script(httpx.Response(200, json=job("cancelled")))
+    assert script.client().cancel_job(UUID(int=1)).state == "cancelled"
+    assert (script.requests[0].method, script.requests[0].url.path) == ("DELETE", f"/jobs/{UUID(int=1)}")
+
+
+def test_a_lost_lease_is_a_conflict_of_its_own() -> None:
+    script = Script(problem(410, type="urn:asim:error:lease-lost"))
+    with pytest.raises(asim.LeaseLost) as raised:
+        script.client().label(LabelsRequest(project=PROJECT))
+    assert isinstance(raised.value, asim.Conflict)
+
+
+def test_followed_events_come_once_each_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+    monkeypatch.setattr("asim.client.time.sleep", pauses.append)
+    pages = [([1, 2], "a"), ([3], None), ([3, 4], None), ([3, 4, 5], "b"), ([6], None)]
+    script = Script(
+        *(httpx.Response(200, json={"items": [event(each) for each in ids], "next": cursor}) for ids, cursor in pages)
+    )
+    followed = script.client().follow_events(PROJECT)
+    assert [next(followed).id for _ in range(6)] == [1, 2, 3, 4, 5, 6]
+    assert [request.url.params.get("cursor") for request in script.requests] == [None, "a", "a", "a", "b"]
+    assert pauses == [1.0, 1.0]
 
 
 def test_a_patch_carries_only_the_fields_that_are_set() -> None:

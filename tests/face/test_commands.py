@@ -2,13 +2,18 @@
 
 import json
 import re
+import signal
+import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Protocol
+from uuid import UUID, uuid4
 
 import numpy as np
 import pytest
 
+from api_schemas.collections import CollectionCreate
 from asim.cli import main
 from asim.client import Client
 
@@ -16,7 +21,7 @@ from asim.client import Client
 class Asim(Protocol):
     """The command line in this process."""
 
-    def __call__(self, *arguments: str, status: int = 0) -> str: ...
+    def __call__(self, *arguments: str, status: int = 0, stderr: bool = False) -> str: ...
 
 
 SPACES = {
@@ -27,16 +32,16 @@ SPACES = {
 
 @pytest.fixture
 def asim(url: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Asim:
-    """Runs one command; returns what it printed, on stderr where it has to fail."""
+    """Runs one command; returns what it printed, on stderr where it has to fail or that is asked for."""
     monkeypatch.setenv("ASIM_URL", url)
 
-    def run(*arguments: str, status: int = 0) -> str:
+    def run(*arguments: str, status: int = 0, stderr: bool = False) -> str:
         monkeypatch.setattr(sys, "argv", ["asim", *arguments])
         with pytest.raises(SystemExit) as end:
             main()
         printed, complained = capsys.readouterr()
         assert (end.value.code or 0) == status, printed + complained
-        return printed if status == 0 else complained
+        return complained if status or stderr else printed
 
     return run
 
@@ -102,12 +107,73 @@ def test_mistakes_cost_one_sentence(asim: Asim, own: str, tmp_path: Path) -> Non
         ("collect", own, "--transitions", "5"): "names no simulator",
         ("round", own): "has no pool labels to train on",
         ("error", own, "nothing"): "no project is named 'nothing'",
+        ("jobs", "nothing"): "no project is named 'nothing'",
+        ("events", "nothing"): "no project is named 'nothing'",
+        ("cancel", str(UUID(int=3))): f"there is no job '{UUID(int=3)}'",
+        ("acquire", own, "--mode", "explore"): "asked for 16 segments, 0 are unlabeled",
+        ("acquire", own, "--mode", "explore", "--purpose", "held_out"): "'held_out' cannot be explored",
     }
     for arguments, sentence in mistakes.items():
         said = asim(*arguments, status=1)
         assert sentence in said, (arguments, said)
         assert said.startswith("asim: ")
         assert said.count("\n") == 1, said
+
+
+def test_a_batch_that_is_smaller_says_why(asim: Asim, url: str, own: str, tmp_path: Path) -> None:
+    asim("import", own, str(recording(tmp_path / "one.npz", 1, labeled=False)), "--split", "pool")
+    with Client(url) as client:
+        client.acquire(client.find_project(own).id, 4, wait=60)
+    said = asim("acquire", own, "--count", "30", stderr=True)
+    assert "a smaller batch: 30 were asked for, 8 are left in the pool split" in said
+
+
+def test_states_to_explore_from_come_with_the_actions_to_execute(asim: Asim, own: str, tmp_path: Path) -> None:
+    asim("import", own, str(recording(tmp_path / "one.npz", 2, labeled=False)), "--split", "pool")
+    printed = asim("acquire", own, "--mode", "explore", "--count", "5")
+    assert len(re.findall(r"^\d +[0-9a-f]{64} +\d+ +1 +\[[0-6]\] *$", printed, re.MULTILINE)) == 5
+    assert "5 states to explore from by random" in printed
+    items = json.loads(asim("acquire", own, "--mode", "explore", "--count", "5", "--json"))["items"]
+    assert [len(item["actions"]) for item in items] == [1] * 5
+
+
+def test_jobs_are_listed_and_cancelled_and_events_say_who_did_what(asim: Asim, url: str) -> None:
+    name = f"cancel-{uuid4().hex[:8]}"
+    asim("project", "create", name, "--simulator", "minigrid")
+    with Client(url) as client:
+        project = client.find_project(name).id
+        job = client.collect(CollectionCreate(project=project, transitions=10_000_000)).id
+    assert f"job {job} (collect) is cancelled" in asim("cancel", str(job))
+    assert f"job {job} (collect) is cancelled" in asim("cancel", str(job))
+    row = next(line for line in asim("jobs", name).splitlines() if line.startswith(str(job)))
+    assert re.search(r"collect +cancelled +[01] of \d +\d+%", row)
+    (as_json,) = map(json.loads, asim("jobs", name, "--json").splitlines())
+    assert (as_json["id"], as_json["state"]) == (str(job), "cancelled")
+    lines = asim("events", name).splitlines()
+    moment, told_of = lines[0].split("Z ", 1)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", moment)
+    assert told_of == f'local project.created {{"name": "{name}"}}'
+    assert any(" local job.cancelled " in line for line in lines)
+    told = [json.loads(line) for line in asim("events", name, "--json").splitlines()]
+    assert [event["kind"] for event in told] == [line.split()[3] for line in lines]
+    assert told[0]["correlation"]
+
+
+def test_followed_events_arrive_as_they_happen_until_ctrl_c(asim: Asim, url: str, own: str) -> None:
+    argv = [sys.executable, "-m", "asim", "events", own, "--follow", "--url", url]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as following:
+        watchdog = threading.Timer(30, following.kill)
+        watchdog.start()
+        try:
+            assert following.stdout is not None
+            assert " project.created " in following.stdout.readline()
+            asim("project", "set", own, "--round-labels", "7")
+            assert following.stdout.readline().endswith(' project.changed {"round_labels": 7}\n')
+            following.send_signal(signal.SIGINT)
+            assert following.wait(timeout=10) == 0
+        finally:
+            watchdog.cancel()
+            following.kill()
 
 
 def test_where_nothing_listens_the_url_is_named(asim: Asim) -> None:

@@ -24,6 +24,7 @@ COMMANDS: list[list[str]] = [
     ["project"],
     ["project", "create"],
     *([name] for name in ("serve", "worker", "demo", "collect", "import", "acquire", "label", "round", "error")),
+    *([name] for name in ("jobs", "cancel", "events")),
 ]
 
 

@@ -8,7 +8,8 @@ import pytest
 from sqlalchemy import delete, select, update
 
 from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, JobRow, LabelRow, QueueRow
-from tests.loop.invariants import Segment, check_invariants
+from tests.loop.invariants import check_invariants
+from tests.loop.rows import Segment
 from tests.workers.conftest import open_loop
 from tests.workers.in_process import Loop
 

@@ -60,14 +60,14 @@ class CannedApi:
     def add_round(self, project: UUID, loss: float | None, status: RoundStatus = "current") -> Round:
         own = [each for each in self.rounds if each.project == project]
         number = len(own) + 1
-        done = status in ("current", "superseded")
+        done, over = status in ("current", "superseded"), status in ("current", "superseded", "failed", "cancelled")
         round_ = Round(
             id=uuid4(), project=project, number=number, watermark=100 * number, labels=100 * number, status=status,
             stages=[Stage(name="inverse_dynamics", seconds=14.2), Stage(name="world_model", seconds=48.75)], models={},
             model_error=None if loss is None else model_error(loss), job=uuid4(),
             error="segment 3f at 12: loss is nan" if status == "failed" else None,
             created_at=START + timedelta(minutes=20 * number),
-            finished_at=START + timedelta(minutes=20 * number + 4) if done else None,
+            finished_at=START + timedelta(minutes=20 * number + 4) if over else None,
         )  # fmt: skip
         self.rounds = [
             each.model_copy(update={"status": "superseded"})
@@ -90,15 +90,16 @@ class CannedApi:
             id=uuid4(), project=project, kind=kind, queue="train", state=state, attempts=0 if state == "queued" else 1,
             max_attempts=5, progress=progress, message=message, result={}, error=error, created_at=began,
             started_at=None if state == "queued" else began, heartbeat_at=None,
-            finished_at=began + timedelta(minutes=1) if state in ("done", "failed") else None,
+            finished_at=began + timedelta(minutes=1) if state in ("done", "failed", "cancelled") else None,
         )  # fmt: skip
         self.jobs.insert(0, job)
         return job
 
-    def add_event(self, project: UUID, kind: str, data: dict[str, object]) -> None:
+    def add_event(self, project: UUID, kind: str, data: dict[str, object], actor: str = "local") -> None:
         identity = len(self.events) + 1
         moment = START + timedelta(minutes=identity)
-        self.events.append(Event(id=identity, project=project, kind=kind, data=data, created_at=moment))
+        by = {"actor": actor, "correlation": "canned"}
+        self.events.append(Event(id=identity, project=project, kind=kind, data=data, created_at=moment, **by))
 
     def curve(self, project: UUID) -> ModelErrorCurve:
         points = [

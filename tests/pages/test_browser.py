@@ -95,6 +95,34 @@ def test_the_newest_of_many_events_are_shown_and_new_ones_join_them(api: CannedA
     expect(page.locator(".event > .hint").last).to_have_text("number 1250")
 
 
+def test_cancelled_work_is_shown_as_such_and_events_name_who_did_it(api: CannedApi, site: Site, page: Page) -> None:
+    project = api.add_project("arm", labeled=200)
+    api.add_round(project, 2.5)
+    stopped = api.add_round(project, None, status="cancelled")
+    job = api.add_job(project, "train_round", "cancelled", 0.3, "world_model step 300 of 1000")
+    api.jobs = [job.model_copy(update={"id": stopped.job})]
+    api.add_event(project, "job.cancelled", {"kind": "train_round"}, actor=f"key 7 {HOSTILE}")
+    page.goto(f"{site.address}/dashboard")
+    expect(page.locator("#round .big")).to_have_text("1 current")
+    expect(page.locator("#round .working")).to_contain_text("Round 2 cancelled")
+    expect(page.locator("#round progress")).to_have_count(0)
+    expect(page.locator("#rounds tbody tr").first).to_contain_text("cancelled")
+    expect(page.locator(".job .badge")).to_have_text("cancelled")
+    expect(page.locator(".job progress")).to_have_count(0)
+    expect(page.locator(".event .name")).to_have_text("job cancelled")
+    expect(page.locator(".event .actor")).to_have_text(f"by key 7 {HOSTILE}")
+
+
+def test_a_project_without_a_model_family_says_that_it_trains_nothing(api: CannedApi, site: Site, page: Page) -> None:
+    project = api.add_project("own robot", labeled=20)
+    api.update_project(project, family=None)
+    page.goto(f"{site.address}/dashboard")
+    expect(page.locator("#project-about")).to_contain_text("no model family")
+    for place in ("#round", "#curve-empty", "#rounds"):
+        expect(page.locator(place)).to_contain_text("No model family takes this project's spaces")
+    expect(page.locator("#labels .big")).to_have_text("20 of 500 spent")
+
+
 def test_a_second_project_is_overlaid_and_the_address_keeps_it(api: CannedApi, site: Site, page: Page) -> None:
     chosen, other = api.add_project("cycle", labeled=200), api.add_project("random", labeled=100)
     for project, losses in ((chosen, (2.0, 1.2)), (other, (2.6, 2.2, 2.0))):
@@ -201,7 +229,7 @@ def test_the_page_fits_a_phone(api: CannedApi, site: Site, page: Page) -> None:
     project = api.add_project("a-name-with-no-space-" + "x" * 59, labeled=200)
     api.add_round(project, 2.5)
     api.add_job(project, "train_round", "failed", 0.4, "m" * 90, error="e" * 200)
-    api.add_event(project, "labels_accepted", {"note": "n" * 300})
+    api.add_event(project, "labels_accepted", {"note": "n" * 300}, actor="worker " + "w" * 150)
     page.set_viewport_size({"width": 360, "height": 740})
     page.goto(f"{site.address}/dashboard")
     expect(page.locator("#chart-loss .plot .point")).to_have_count(1)

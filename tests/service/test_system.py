@@ -4,16 +4,19 @@ import json
 import shutil
 import subprocess
 import sys
+from typing import Any
 from uuid import UUID
 
 from prometheus_client.parser import text_string_to_metric_families
 
+from api_schemas.jobs import TrainSubgoalGenerator
 from api_schemas.rounds import ModelError
 from api_schemas.strategies import STRATEGY_NAMES
-from service import jobs, rounds
+from service import canary, jobs, rounds
 from service.store.tables import ProjectRow
 from tests.service.conftest import Serve
 from tests.service.kit import Served, answers, room
+from workers.dispatch import run_next
 
 NAME = 'a "quoted" \\ name'
 
@@ -29,27 +32,82 @@ def metrics(served: Served) -> dict[tuple[str, ...], float]:
     }
 
 
-def alive(served: Served) -> None:
+QUEUES = ("train", "score", "label")
+
+
+def alive(served: Served, *queues: str, owner: str = "ada:1") -> None:
     with served.services.database.write() as session:
-        jobs.worker_alive(session, "ada:1", ["score"], served.clock())
+        jobs.worker_alive(session, owner, queues, served.clock())
 
 
-def test_the_service_is_ready_while_a_worker_is_heard_of(served: Served) -> None:
+def plant(served: Served) -> None:
+    with served.services.database.write() as session:
+        canary.plant(session, served.clock(), served.settings.canary_seconds / 4)
+
+
+def do_canaries(served: Served, *queues: str) -> None:
+    plant(served)
+    for queue in queues:
+        assert run_next(served.worker(queue))
+
+
+def readiness(served: Served) -> tuple[int, dict[str, Any]]:
+    answer = served.client.get("/health/ready")
+    return answer.status_code, dict(answer.json())
+
+
+def test_the_service_is_ready_while_the_canaries_of_all_queues_are_done(served: Served) -> None:
     assert served.client.get("/health/live").json() == {"status": "ok"}
-    silent = served.client.get("/health/ready")
-    assert (silent.status_code, silent.json()["status"], silent.json()["workers_alive"]) == (503, "unavailable", 0)
-    assert (silent.json()["database"], silent.json()["blobs"]) == (True, True)
-    alive(served)
-    alive(served)
-    ready = served.client.get("/health/ready")
-    assert (ready.status_code, ready.json()["status"], ready.json()["workers_alive"]) == (200, "ok", 1)
-    served.clock.advance(31)
-    assert served.client.get("/health/ready").status_code == 503
+    status, silent = readiness(served)
+    assert (status, silent["status"], silent["workers_alive"]) == (503, "unavailable", 0)
+    assert (silent["database"], silent["blobs"], silent["canaries"]) == (True, True, dict.fromkeys(QUEUES))
+    alive(served, *QUEUES)
+    assert readiness(served)[0] == 503  # a worker that says that it is there has not worked yet
+    do_canaries(served, "train", "score")
+    assert readiness(served)[0] == 503
+    do_canaries(served, "label")
+    status, ready = readiness(served)
+    assert (status, ready["status"], ready["workers_alive"]) == (200, "ok", 1)
+    served.clock.advance(served.settings.canary_seconds - 1)
+    status, late = readiness(served)
+    assert (status, late["workers_alive"]) == (200, 0)
+    assert all(age is not None and 59 <= age < 60 for age in late["canaries"].values())
+    served.clock.advance(2)
+    assert readiness(served)[0] == 503
+
+
+def test_planting_or_failing_anew_does_not_make_a_canary_younger(served: Served) -> None:
+    do_canaries(served, *QUEUES)
+    served.clock.advance(40)
+    plant(served)
+    assert {round(age) for age in readiness(served)[1]["canaries"].values()} == {40}
+    with served.services.database.write() as session:
+        row = jobs.claim_next(session, ("label",), "ada:1", served.clock(), 15.0)
+        assert row is not None
+        jobs.fail(session, jobs.lease_of(row), "it fell over", served.clock(), retry=False)
+    assert {round(age) for age in readiness(served)[1]["canaries"].values()} == {40}
+
+
+def test_a_queue_whose_worker_is_at_work_is_served(served: Served) -> None:
+    do_canaries(served, *QUEUES)
+    served.clock.advance(61)
+    project = served.project()
+    payload = TrainSubgoalGenerator(project=UUID(project))
+    with served.services.database.write() as session:
+        jobs.enqueue(session, UUID(project), payload, UUID(project), served.clock())
+        row = jobs.claim_next(session, ("train",), "ada:1", served.clock(), 15.0)
+        assert row is not None
+    do_canaries(served, "score", "label")
+    assert readiness(served)[0] == 503  # nobody knows which queues the holder serves
+    alive(served, "train")
+    assert readiness(served)[0] == 200
+    served.clock.advance(16)  # its lease ends
+    assert readiness(served)[0] == 503
 
 
 def test_readiness_says_which_store_is_gone(start: Serve) -> None:
     served = start()
-    alive(served)
+    do_canaries(served, *QUEUES)
     shutil.rmtree(served.settings.data_folder / "blobs")
     gone = served.client.get("/health/ready")
     assert (gone.status_code, gone.json()["blobs"], gone.json()["database"]) == (503, False, True)

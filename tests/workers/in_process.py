@@ -145,6 +145,11 @@ class Loop:
         """Change the labeling policy."""
         self.client.change_project(self.project.id, ProjectPatch(**fields))
 
+    def cancel(self, job: UUID) -> None:
+        """DELETE /jobs/{id}."""
+        answer = self._http.delete(f"/jobs/{job}")
+        assert (answer.status_code, answer.json()["state"]) == (200, "cancelled"), answer.text
+
     def requeue(self, job: UUID) -> None:
         """Put a job back, as after a crash between its last write and its completion."""
         self.set_row("job", job, state="queued", owner=None, lease_until=None, finished_at=None)

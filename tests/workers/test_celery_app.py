@@ -1,17 +1,27 @@
 """What the Celery worker knows of its command line, and what is sent to it."""
 
+import subprocess
 from datetime import timedelta
 from typing import Any
+from uuid import UUID
 
 import pytest
 from celery import Celery
+from redis import Redis
 
-from service.carrier import RESEND_AFTER, relay
+from service import jobs
+from service.carrier import Relay, celery_app, impatient_app, messages_in, relay
+from service.settings import Settings
+from service.store.tables import JobRow
+from tests.loop.processes import eventually
+from tests.private_servers import free_port
+from tests.servers import RedisSpace, redis_server, redis_space
 from tests.workers.in_process import Loop
-from workers import training
 from workers.app import served_queues
 from workers.dispatch import run_next
+from workers.stage import Stage
 
+__all__ = ["redis_server", "redis_space"]
 ALL = ("train", "score", "label", "default")
 
 
@@ -40,25 +50,80 @@ class Sent(Celery):  # type: ignore[misc]  # celery has no types
         self.messages.append((queue, args[0]))
 
 
-def test_a_job_is_sent_once_and_again_when_nobody_has_claimed_it(labeled: Loop) -> None:
-    asked = labeled.client.start_round(labeled.project.id)
-    sent, now, later = Sent(), labeled.clock(), labeled.clock() + RESEND_AFTER + timedelta(seconds=1)
-    assert relay(labeled.worker.database, sent, "x", now) == 2
-    assert ("x.train", str(asked.job)) in sent.messages
-    assert relay(labeled.worker.database, sent, "x", now) == 0
-    assert relay(labeled.worker.database, sent, "x", later) == 2
+def sent(loop: Loop, job: UUID | None) -> bool:
+    """Whether the carrier was given the job."""
+    with loop.worker.database.read() as session:
+        return job is not None and session.get_one(JobRow, job).sent_at is not None
+
+
+@pytest.fixture
+def carried(labeled: Loop, redis_space: RedisSpace) -> Settings:
+    """Settings of `labeled`, but with a broker."""
+    return labeled.settings.model_copy(update={"broker_url": redis_space.url, "celery_prefix": redis_space.prefix})
+
+
+def test_a_job_is_sent_again_when_nobody_claims_it_and_its_message_is_lost(
+    labeled: Loop, carried: Settings, redis_space: RedisSpace
+) -> None:
+    labeled.client.start_round(labeled.project.id)  # and with it the first subgoal generator
+    app, database, queue = impatient_app(carried), labeled.worker.database, f"{redis_space.prefix}.train"
+
+    def relayed(seconds: float) -> int:
+        return relay(database, app, carried, labeled.clock() + timedelta(seconds=seconds))
+
+    assert (relayed(0), relayed(0)) == (2, 0)
+    assert messages_in(app, queue) == 2
+    assert relayed(carried.resend_seconds + 1) == 0  # the workers are busy: both messages wait
+    with Redis.from_url(redis_space.url) as broker:
+        assert broker.delete(f"{redis_space.prefix}:{queue}") == 1  # the broker loses what it had
+    assert messages_in(app, queue) == 0
+    assert relayed(carried.resend_seconds - 1) == 0
+    assert relayed(carried.resend_seconds + 1) == 2
+    assert messages_in(app, queue) == 2
+    app.close()
+
+
+def test_a_relay_goes_on_when_the_broker_is_back(labeled: Loop) -> None:
+    """Neither dead nor stuck: silent workers are reaped, and what waits is sent, at the first moment it can be."""
+    asked, port = labeled.client.start_round(labeled.project.id), free_port()
+    settings = labeled.settings.model_copy(update={"broker_url": f"redis://127.0.0.1:{port}/0"})
+    with labeled.worker.database.write() as session:
+        silent = jobs.claim_next(session, ("train",), "silent", labeled.clock() - timedelta(hours=1), 1.0)
+        assert silent is not None
+    running = Relay(labeled.worker.database, settings, labeled.clock)
+    running.start()
+    try:
+        eventually(lambda: labeled.client.job(silent.id).state == "queued", 20, "nobody reaps")
+        labeled.clock.advance(2)  # the pause after the lost attempt
+        command = ["redis-server", "--port", str(port), "--bind", "127.0.0.1", "--save", ""]
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as broker:
+            try:
+                eventually(lambda: sent(labeled, asked.job), 20, "nothing is sent")
+            finally:
+                broker.terminate()
+    finally:
+        running.stop()
+
+
+def test_only_redis_gets_the_options_of_redis(carried: Settings) -> None:
+    options = celery_app(carried, current=False).conf.broker_transport_options
+    assert options["visibility_timeout"] == carried.visibility_seconds == 900
+    assert options["unacked_restore_interval"] * options["unacked_restore_throttle"] <= 10
+    rabbit = carried.model_copy(update={"broker_url": "amqp://guest@127.0.0.1//"})
+    assert celery_app(rabbit, current=False).conf.broker_transport_options == {}
+    assert not {"socket_timeout", "global_keyprefix"} & set(impatient_app(rabbit).conf.broker_transport_options)
 
 
 def test_a_job_that_failed_is_not_sent_before_its_pause_is_over(labeled: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(training, "train", fail)
+    monkeypatch.setattr(Stage, "train", fail)
     asked = labeled.client.start_round(labeled.project.id)
     run_next(labeled.worker)
-    sent = Sent()
-    relay(labeled.worker.database, sent, "x", labeled.clock())
-    assert ("x.train", str(asked.job)) not in sent.messages
+    app, settings = Sent(), labeled.settings.model_copy(update={"celery_prefix": "x"})
+    relay(labeled.worker.database, app, settings, labeled.clock())
+    assert ("x.train", str(asked.job)) not in app.messages
     labeled.clock.advance(2)
-    relay(labeled.worker.database, sent, "x", labeled.clock())
-    assert ("x.train", str(asked.job)) in sent.messages
+    relay(labeled.worker.database, app, settings, labeled.clock())
+    assert ("x.train", str(asked.job)) in app.messages

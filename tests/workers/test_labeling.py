@@ -1,6 +1,7 @@
 """The labeling worker: the simulator explains every step that it labels."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from api_schemas.acquisitions import Acquisition, AcquisitionItem
 from api_schemas.environments import Environment
-from api_schemas.labels import Label
+from api_schemas.labels import Label, LabelsAccepted, LabelsRequest
+from asim.client import Client
+from asim.errors import Conflict, LeaseLost
 from tests.workers.conftest import ROOM, OpenLoop
 from tests.workers.in_process import Loop, segments_of
-from workers import labeling
+from workers import delivery
 from workers.explanation import explain
 from workers.labeling import UnexplainedStep, run_labeling
 from workers.simulators.catalog import make_simulator
@@ -97,7 +101,7 @@ def test_an_answer_sent_again_is_a_duplicate_even_where_the_draw_differs(labeled
 
 
 def test_a_large_batch_goes_in_several_requests(labeled: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(labeling, "BATCH", 8)
+    monkeypatch.setattr(delivery, "BATCH", 8)
     labeled.change(round_labels=10)
     batch = labeled.acquire(30, "random")
     seen: list[tuple[int, int]] = []
@@ -130,6 +134,136 @@ def test_an_observation_that_no_action_explains_is_given_back_and_the_others_are
     assert (answered.status, labeled.project.counts.leased) == ("released", 0)
 
 
+def test_explorations_are_executed_and_come_back_as_labeled_trajectories(labeled: Loop) -> None:
+    labeled.change(label_budget=500)
+    before = labeled.project
+    batch = labeled.acquire(12, mode="explore")
+    reserved = labeled.project.budget
+    assert (reserved.spent, reserved.reserved) == (before.counts.labeled, 12)
+    accepted = run_labeling(labeled.client, batch, np.random.default_rng(0))
+    after = labeled.project
+    assert len(accepted.receipts) == 12
+    assert after.counts.labeled == before.counts.labeled + accepted.created
+    found = {receipt.trajectory for receipt in accepted.receipts}
+    known = {each.id for each in labeled.client.trajectories(after.id)} - found
+    assert after.counts.pool_trajectories == before.counts.pool_trajectories + len(found)
+    assert after.counts.pool_segments == before.counts.pool_segments + len(found)
+    assert found.isdisjoint(known)
+    assert (after.budget.spent, after.budget.reserved) == (after.counts.labeled, 0)
+    answered = labeled.client.acquisition(batch.id)
+    assert (answered.status, {item.labeled for item in answered.items}) == ("labeled", {True})
+    again = run_labeling(labeled.client, batch, np.random.default_rng(1))
+    assert (again.created, again.duplicates) == (0, 12)
+    assert labeled.project.counts == after.counts
+
+
+def test_what_an_exploration_brings_is_what_the_simulator_shows_and_all_that_explains_it(labeled: Loop) -> None:
+    batch = labeled.acquire(10, mode="explore")
+    accepted = run_labeling(labeled.client, batch, np.random.default_rng(0))
+    simulator, project = make_simulator("minigrid", ROOM.options), labeled.project.id
+    labels = labels_of(labeled, [(receipt.trajectory, receipt.start) for receipt in accepted.receipts])
+    for item, label in zip(batch.items, labels, strict=True):
+        states, _ = labeled.client.provenance(project, item.trajectory, item.start, 1)
+        state = {name: array[0] for name, array in states.items()}
+        seen = labeled.client.trajectory_content(project, item.trajectory, item.start, 1)
+        brought = labeled.client.trajectory_content(project, label.trajectory)
+        assert label.actions == item.actions
+        assert item.actions is not None
+        simulator.restore(state)
+        reached = simulator.step(int(np.asarray(item.actions[0]))).observation
+        for name, stream in brought.items():
+            np.testing.assert_array_equal(stream, np.stack([seen[name][0], reached[name]]))
+        assert label.action_sets == [explain(simulator, state, reached)[0]]
+        assert label.source.kind == "simulator"
+        assert label.acquisition == batch.id
+
+
+def test_an_exploration_that_ends_in_the_other_split_is_given_back_and_the_others_are_stored(
+    labeled: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = labeled.acquire(9, mode="explore")
+    before = labeled.project.counts
+    _into_held_out(labeled, monkeypatch, batch, rank=4)
+    with pytest.raises(Conflict, match="is in the split 'held_out' of this project, not in 'pool'"):
+        run_labeling(labeled.client, batch, np.random.default_rng(0))
+    answered = labeled.client.acquisition(batch.id)
+    unanswered = [item for item in answered.items if not item.labeled]
+    twins = [item for item in batch.items if (item.trajectory, item.start, item.actions) == _what(batch.items[4])]
+    assert [item.rank for item in unanswered] == [item.rank for item in twins]
+    counts = labeled.project.counts
+    assert (answered.status, labeled.project.budget.reserved) == ("released", 0)
+    assert counts.labeled > before.labeled
+    assert counts.held_out_labeled == before.held_out_labeled
+
+
+def test_explorations_and_labels_beyond_the_byte_limit_go_in_several_requests(
+    labeled: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(delivery, "BATCH_BYTES", 3000)
+    for batch in (labeled.acquire(7, mode="explore"), labeled.acquire(40, "random")):
+        sizes: list[int] = []
+        _measure(monkeypatch, labeled, sizes)
+        accepted = run_labeling(labeled.client, batch, np.random.default_rng(0))
+        assert len(accepted.receipts) == len(batch.items)
+        assert len(sizes) > 1
+        assert max(sizes) <= 3500  # and what stands around the answers
+
+
+def test_the_lease_of_a_slow_simulator_is_extended_by_its_own_length_when_half_of_it_has_passed(
+    labeled: Loop,
+) -> None:
+    labeled.change(lease_seconds=10)
+    batch = labeled.acquire(20, "random", lease_seconds=600)
+
+    def slow(done: int, of: int) -> None:
+        labeled.clock.advance(100)
+
+    accepted = run_labeling(labeled.client, batch, np.random.default_rng(0), slow, labeled.clock)
+    assert accepted.created == 20
+    extensions = [event for event in labeled.client.events(labeled.project.id) if event.kind == "lease.extended"]
+    assert len(extensions) == 6  # after 300, 600, ... seconds of 2,000
+    ends = labeled.client.acquisition(batch.id).lease_expires_at
+    assert (ends - extensions[-1].created_at).total_seconds() == pytest.approx(600, abs=1)
+
+
+def test_a_short_batch_does_not_extend_its_lease(labeled: Loop) -> None:
+    labeled.label(5, "random")
+    assert "lease.extended" not in {event.kind for event in labeled.client.events(labeled.project.id)}
+
+
+def test_a_lease_that_is_lost_meanwhile_is_said_so_and_what_it_still_covers_is_stored(labeled: Loop) -> None:
+    free = labeled.project.counts.unlabeled
+    batch = labeled.acquire(free, "random", lease_seconds=60)
+    taken = []
+
+    def overslept(done: int, of: int) -> None:
+        if done == of:
+            labeled.clock.advance(90)
+            taken.append(labeled.acquire(3, "random"))
+
+    before = labeled.project.counts.labeled
+    with pytest.raises(LeaseLost, match=rf"lost while its {free} items were answered: acquisition {batch.id}: it does"):
+        run_labeling(labeled.client, batch, np.random.default_rng(0), overslept, labeled.clock)
+    assert labeled.project.counts.labeled == before + free - 3
+    run_labeling(labeled.client, taken[0], np.random.default_rng(0))
+    assert labeled.project.counts.labeled == before + free
+
+
+def test_a_lease_that_was_given_back_ends_the_labeling_at_once(labeled: Loop) -> None:
+    batch = labeled.acquire(10, "random", lease_seconds=60)
+    labeled.client.release(batch.id, batch.token or 0)
+    labeled.clock.advance(1)
+    done: list[int] = []
+
+    def late(number: int, of: int) -> None:
+        done.append(number)
+        labeled.clock.advance(40)
+
+    with pytest.raises(LeaseLost, match=r"the lease was lost while its 10 items were answered: .* it is released"):
+        run_labeling(labeled.client, batch, np.random.default_rng(0), late, labeled.clock)
+    assert done == [1]
+
+
 def test_explain_gives_nothing_where_even_the_best_action_misses() -> None:
     simulator = make_simulator("minigrid", ROOM.options)
     observed = simulator.reset(1)
@@ -147,6 +281,37 @@ def test_a_project_without_a_simulator_is_refused_in_a_sentence(labeled: Loop) -
     labeled.set_row("project", labeled.project.id, environment=environment)
     with pytest.raises(ValueError, match="names no simulator; its labels must come from elsewhere"):
         run_labeling(labeled.client, batch, np.random.default_rng(0))
+
+
+def _what(item: AcquisitionItem) -> tuple[object, ...]:
+    return item.trajectory, item.start, item.actions
+
+
+def _into_held_out(loop: Loop, monkeypatch: pytest.MonkeyPatch, batch: Acquisition, rank: int) -> None:
+    """What this item's exploration will observe stands in the held-out split already."""
+    sent: list[LabelsRequest] = []
+
+    def kept(request: LabelsRequest) -> LabelsAccepted:
+        sent.append(request)
+        raise InterruptedError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop.client, "label", kept)
+        with suppress(InterruptedError):
+            run_labeling(loop.client, batch, np.random.default_rng(0))
+    (found,) = [each for each in sent[0].trajectories if each.rank == rank]
+    loop.client.add_files(loop.project.id, {"found": found.content}, split="held_out")
+
+
+def _measure(monkeypatch: pytest.MonkeyPatch, loop: Loop, sizes: list[int]) -> None:
+    """Notes the bytes of each request for labels."""
+    label = Client.label
+
+    def measured(client: Client, request: LabelsRequest) -> LabelsAccepted:
+        sizes.append(len(request.model_dump_json()))
+        return label(client, request)
+
+    monkeypatch.setattr(Client, "label", measured)
 
 
 def _bend(monkeypatch: pytest.MonkeyPatch, loop: Loop, chosen: Callable[[tuple[str, int]], bool]) -> None:

@@ -8,27 +8,33 @@ import torch
 
 from api_schemas.jobs import Job
 from models.segments import SegmentBatch
-from models.training import TrainingState, train_subgoal_generator
+from models.training import TrainingState, advance
 from tests.workers.conftest import STEPS, OpenLoop
 from tests.workers.in_process import Loop
-from workers import training
+from workers import stage, training
 from workers.dispatch import run_next
+
+SLICE = stage.FIRST_STEPS
 
 
 class Slices:
-    """Watches workers.training's slices: the batches and states they were given; something may happen after one."""
+    """Watches the generator's slices, of SLICE steps each: what they were given; something may happen after one."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.batches: list[SegmentBatch] = []
         self.steps: list[int] = []
         self.after: dict[int, Any] = {}
-        self._real = train_subgoal_generator
-        patch.setattr(training, "train_subgoal_generator", self._train)
+        patch.setattr(stage, "advance", self._advance)
+        patch.setattr(stage, "_next_steps", lambda *_: SLICE)
 
-    def _train(self, network: Any, batch: SegmentBatch, state: TrainingState, steps: int) -> TrainingState:
+    def _advance(
+        self, network: Any, batch: SegmentBatch, state: TrainingState, until: int, **more: Any
+    ) -> TrainingState:
+        trained = advance(network, batch, state, until, **more)
+        if network.kind != "subgoal_generator":
+            return trained
         self.batches.append(batch)
         self.steps.append(state.step)
-        trained = self._real(network, batch, state, steps)
         self.after.pop(len(self.steps), lambda: None)()
         return trained
 
@@ -70,7 +76,7 @@ def test_it_comes_after_all_other_work(trained: Loop) -> None:
 def test_it_sees_the_whole_pool_and_no_action(waiting: Loop, slices: Slices) -> None:
     waiting.drain()
     assert waiting.project.counts.labeled == 60
-    assert len(slices.batches) == STEPS // training.SUBGOAL_SLICE
+    assert len(slices.batches) == STEPS // SLICE
     for batch in slices.batches:
         assert batch.actions is None
         assert batch.action_sets is None
@@ -91,7 +97,7 @@ def test_it_gives_way_and_ends_with_the_same_bits(waiting: Loop, slices: Slices,
     assert (job.state, job.attempts, job.error) == ("queued", 0, None)
     assert len(slices.steps) == 2
     waiting.drain()
-    assert slices.steps == list(range(0, STEPS, training.SUBGOAL_SLICE))  # no step was done twice
+    assert slices.steps == list(range(0, STEPS, SLICE))  # no step was done twice
     assert subgoal_job(waiting).attempts == 1
     assert weights(waiting) == undisturbed["subgoal_generator"]
 
@@ -101,17 +107,17 @@ def test_a_stopping_worker_loses_no_slice(waiting: Loop, slices: Slices, undistu
     run_next(waiting.worker)
     assert (subgoal_job(waiting).state, subgoal_job(waiting).attempts) == ("queued", 0)
     waiting.drain(waiting.another_worker())
-    assert slices.steps == list(range(0, STEPS, training.SUBGOAL_SLICE))
+    assert slices.steps == list(range(0, STEPS, SLICE))
     assert weights(waiting) == undisturbed["subgoal_generator"]
 
 
 def test_after_a_crash_it_resumes_from_the_last_checkpoint(
-    waiting: Loop, slices: Slices, undisturbed: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    waiting: Loop, slices: Slices, undisturbed: dict[str, str]
 ) -> None:
     def crash() -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    waiting.worker = waiting.another_worker(waiting.settings.model_copy(update={"checkpoint_seconds": 1e-9}))
     slices.after = {3: crash}
     waiting.drain()
     waiting.clock.advance(10)

@@ -3,6 +3,7 @@
 import { badge, byId, code, count, digits, duration, empty, h, percent, plural, redraw, when, words } from "./dom.js";
 
 const WORKING = ["queued", "training", "scoring"];
+const NO_FAMILY = "No model family takes this project's spaces: it keeps data and labels, and trains nothing.";
 const EVENT_TEXT = 160; // characters shown of one event's data
 
 /** The list of projects; `href(id)` is the address that chooses one. */
@@ -21,16 +22,17 @@ export function drawHead(project) {
   const { environment, policy } = project;
   byId("project-name").textContent = project.name;
   const segments = `segments of ${plural(project.segment_length, "transition")}`;
-  const rounds = policy.round_labels ? `a round every ${plural(policy.round_labels, "new label")}` : "rounds by hand";
+  const every = policy.round_labels ? `a round every ${plural(policy.round_labels, "new label")}` : "rounds by hand";
+  const rounds = project.family ? every : "no model family";
   byId("project-about").textContent =
     [environment.simulator ?? "own robot", `strategy ${words(policy.strategy)}`, segments, rounds].join(" · ");
 }
 
-/** The current round and, if there is one, the round at work or the one that failed last. */
+/** The current round and, if there is one, the round at work or the one that failed or was cancelled last. */
 export function drawRound(project, rounds, jobs) {
   const current = rounds.find((round) => round.id === project.current_round);
   const latest = rounds[0];
-  const news = latest && latest.id !== current?.id && [...WORKING, "failed"].includes(latest.status) ? latest : null;
+  const news = latest && latest.id !== current?.id && [...WORKING, "failed", "cancelled"].includes(latest.status) ? latest : null;
   const job = news && jobs.find((each) => each.id === news.job);
   redraw(byId("round"), [current, news, job?.state, job?.progress, job?.message, project.policy.round_labels, project.counts.labeled > 0], () => {
     if (!latest) return firstRound(project);
@@ -42,6 +44,7 @@ export function drawRound(project, rounds, jobs) {
 }
 
 function firstRound(project) {
+  if (!project.family) return empty(NO_FAMILY);
   const every = project.policy.round_labels;
   const own = every ? ` A round starts by itself every ${count(every)} new pool labels.` : "";
   if (!project.counts.labeled) return empty("No round yet. Take segments with ", code("POST /acquire"), " and label them with ", code("POST /labels"), ".", own);
@@ -102,6 +105,7 @@ function segments(name, total, parts, legend) {
 /** Why there is no learning curve yet, and what to do about it. */
 export function curveAdvice(project, rounds) {
   const { counts } = project;
+  if (!project.family) return NO_FAMILY;
   if (rounds.some((round) => WORKING.includes(round.status)) && counts.held_out_labeled) return "No model error yet: the first point appears when the round has been evaluated.";
   if (!counts.held_out_labeled) return "No model error yet: upload held-out labels, then start a round.";
   if (!counts.labeled) return "No model error yet: label segments of the pool, then start a round.";
@@ -163,7 +167,7 @@ function dataText(data) {
 /** Events, newest first. */
 export function drawEvents(events) {
   const item = (event) => h("li", { class: "event" },
-    h("p", { class: "job-head" }, h("span", { class: "name" }, words(event.kind)), h("span", { class: "hint" }, when(event.created_at))),
+    h("p", { class: "job-head" }, h("span", { class: "name" }, words(event.kind)), event.actor ? h("span", { class: "actor" }, `by ${event.actor}`) : null, h("span", { class: "hint" }, when(event.created_at))),
     Object.keys(event.data).length ? h("p", { class: "hint" }, dataText(event.data)) : null);
   redraw(byId("events"), events, () =>
     events.length ? h("ul", { class: "rows", tabindex: 0, "data-key": "events", "aria-label": "Events, newest first" }, ...events.map(item)) : empty("Nothing has happened yet. Uploads, acquisitions, labels and rounds appear here."));

@@ -7,7 +7,9 @@ from uuid import UUID
 from sqlalchemy import and_, delete, func, or_, select, tuple_, update
 from sqlalchemy.orm import Session
 
+from service.store.queries.labels import labels_of
 from service.store.queries.pool import live_claim
+from service.store.queries.segments import Segment, among, parts
 from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, LabelRow, QueueRow, ScoringRow, ShardRow
 
 
@@ -24,8 +26,13 @@ def newest_scoring(
     return session.scalar(statement.order_by(ScoringRow.created_at.desc()).limit(1))
 
 
-def free_queue(session: Session, scoring: ScoringRow, count: int, now: datetime) -> Sequence[QueueRow]:
-    """The best ranked segments that are neither labeled nor under a live lease; expiry is checked here, by no sweep."""
+def free_queue(
+    session: Session, scoring: ScoringRow, count: int, now: datetime, *, lock: bool = False
+) -> Sequence[QueueRow]:
+    """The best ranked segments that are neither labeled nor under a live lease; expiry is checked here, by no sweep.
+
+    lock: pass over the rows that another acquisition reads at this moment (PostgreSQL; SQLite has one writer anyway).
+    """
     label = and_(
         LabelRow.project_id == QueueRow.project_id,
         LabelRow.trajectory_id == QueueRow.trajectory_id,
@@ -43,22 +50,52 @@ def free_queue(session: Session, scoring: ScoringRow, count: int, now: datetime)
         .outerjoin(ClaimRow, claim)
         .where(QueueRow.scoring_id == scoring.id, LabelRow.id.is_(None), ClaimRow.token.is_(None))
     )
-    return session.scalars(statement.order_by(QueueRow.rank).limit(count)).all()
+    statement = statement.order_by(QueueRow.rank).limit(count)
+    return session.scalars(statement.with_for_update(of=QueueRow, skip_locked=True) if lock else statement).all()
+
+
+def taken_among(session: Session, project_id: UUID, segments: Sequence[Segment], now: datetime) -> set[Segment]:
+    """Those of the segments that are labeled or under a live lease."""
+    labels = labels_of(session, project_id, segments)
+    claims = claims_on(session, project_id, segments)
+    return set(labels) | {segment for segment, claim in claims.items() if claim.expires_at > now}
 
 
 def take_claims(session: Session, claims: Sequence[ClaimRow]) -> None:
     """Write claims of one project over the expired ones of the same segments, a few statements for any number."""
-    segments = [(claim.trajectory_id, claim.start) for claim in claims]
-    for i in range(0, len(segments), 500):  # PostgreSQL bounds the depth of a statement
-        named = tuple_(ClaimRow.trajectory_id, ClaimRow.start).in_(segments[i : i + 500])
-        stale = delete(ClaimRow).where(ClaimRow.project_id == claims[0].project_id, named)
-        session.execute(stale.execution_options(synchronize_session=False))
+    drop_claims(session, claims[0].project_id, [(claim.trajectory_id, claim.start) for claim in claims])
     session.add_all(claims)
 
 
-def claim_on(session: Session, project_id: UUID, trajectory: str, start: int) -> ClaimRow | None:
-    """Whoever holds, or last held, the segment."""
-    return session.get(ClaimRow, (project_id, trajectory, start))
+def claims_on(session: Session, project_id: UUID, segments: Sequence[Segment]) -> dict[Segment, ClaimRow]:
+    """By segment, whoever holds, or last held, it."""
+    found: dict[Segment, ClaimRow] = {}
+    for some in parts(segments):
+        named = among(session, ClaimRow.trajectory_id, ClaimRow.start, some)
+        rows = session.scalars(select(ClaimRow).where(ClaimRow.project_id == project_id, named))
+        found |= {(row.trajectory_id, row.start): row for row in rows}
+    return found
+
+
+def drop_claims(session: Session, project_id: UUID, segments: Sequence[Segment]) -> None:
+    """Nobody claims these segments any more."""
+    for some in parts(segments):
+        named = among(session, ClaimRow.trajectory_id, ClaimRow.start, some)
+        gone = delete(ClaimRow).where(ClaimRow.project_id == project_id, named)
+        session.execute(gone.execution_options(synchronize_session=False))
+
+
+def reserved(session: Session, project_id: UUID, now: datetime) -> int:
+    """Labels that live leases on the pool, and on explorations, may still bring."""
+    where = (ClaimRow.project_id == project_id, live_claim(now), ClaimRow.purpose != "held_out")
+    return session.scalar(select(func.count()).where(*where)) or 0
+
+
+def newly_expired(session: Session, now: datetime, limit: int) -> Sequence[AcquisitionRow]:
+    """Leases that have ended and are not noted as expired; those that somebody works on at this moment come later."""
+    where = (AcquisitionRow.status == "leased", AcquisitionRow.lease_expires_at <= now)
+    statement = select(AcquisitionRow).where(*where).limit(limit)
+    return session.scalars(statement.with_for_update(skip_locked=True)).all()
 
 
 def claims_of(session: Session, acquisition_id: UUID, token: int) -> Sequence[ClaimRow]:
@@ -90,13 +127,24 @@ def items_with_labels(session: Session, acquisition_id: UUID) -> Sequence[tuple[
     return [(item, label_id) for item, label_id in session.execute(statement)]
 
 
-def drop_from_queues(session: Session, project_id: UUID, trajectory: str, start: int) -> None:
-    """A labeled segment is in no queue."""
-    session.execute(
-        delete(QueueRow).where(
-            QueueRow.project_id == project_id, QueueRow.trajectory_id == trajectory, QueueRow.start == start
+def has_open_items(session: Session, row: AcquisitionRow) -> bool:
+    """True where an item of the batch has no label, an exploration no answer."""
+    if row.mode == "explore":
+        item = select(AcquisitionItemRow.rank).where(
+            AcquisitionItemRow.acquisition_id == row.id, AcquisitionItemRow.answer.is_(None)
         )
-    )
+        return session.scalar(item.limit(1)) is not None
+    return any(label is None for _, label in items_with_labels(session, row.id))
+
+
+def drop_from_queues(session: Session, project_id: UUID, segments: Sequence[Segment]) -> None:
+    """Labeled segments are in no queue. Rows that an acquisition reads at this moment stay: to wait for it could be to
+    wait for ourselves, and what is labeled is passed over there anyway."""
+    for some in parts(segments):
+        named = among(session, QueueRow.trajectory_id, QueueRow.start, some)
+        rows = select(QueueRow.scoring_id, QueueRow.rank).where(QueueRow.project_id == project_id, named)
+        gone = tuple_(QueueRow.scoring_id, QueueRow.rank).in_(rows.with_for_update(skip_locked=True))
+        session.execute(delete(QueueRow).where(gone).execution_options(synchronize_session=False))
 
 
 def replace_queue(session: Session, scoring: ScoringRow, rows: Sequence[QueueRow]) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import ColumnElement, delete, func, or_, select, update
+from sqlalchemy import ColumnElement, delete, false, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from service.store.tables import JobRow, WorkerRow
@@ -23,8 +23,8 @@ def locked_job(session: Session, job_id: UUID) -> JobRow | None:
 
 
 def higher_waiting(session: Session, queues: Sequence[str], priority: int, now: datetime) -> bool:
-    """True where a job of higher priority waits in one of the queues."""
-    statement = select(JobRow.id).where(_waiting(queues, now), JobRow.priority > priority)
+    """True where a job of higher priority waits in one of the queues; a canary is not worth an interruption."""
+    statement = select(JobRow.id).where(_waiting(queues, now), JobRow.priority > priority, JobRow.kind != "canary")
     return session.scalar(statement.limit(1)) is not None
 
 
@@ -42,11 +42,22 @@ def silent(session: Session, now: datetime) -> Sequence[JobRow]:
     return session.scalars(statement.with_for_update(skip_locked=True)).all()
 
 
-def unsent(session: Session, now: datetime, stale: datetime, limit: int) -> Sequence[JobRow]:
-    """Jobs that may run now and that no carrier was given, or was given before `stale`."""
-    due = or_(JobRow.sent_at.is_(None), JobRow.sent_at <= stale)
-    statement = select(JobRow).where(JobRow.state == "queued", _ready(now), due)
-    return session.scalars(statement.order_by(JobRow.created_at).limit(limit)).all()
+def unsent(session: Session, now: datetime, limit: int) -> Sequence[JobRow]:
+    """Jobs that may run now and that no carrier was given, those of highest priority first."""
+    statement = select(JobRow).where(JobRow.state == "queued", _ready(now), JobRow.sent_at.is_(None))
+    return session.scalars(statement.order_by(JobRow.priority.desc(), JobRow.created_at).limit(limit)).all()
+
+
+def unclaimed(session: Session, now: datetime, sent_before: datetime, limit: int) -> Sequence[JobRow]:
+    """Jobs that may run, were given to a carrier before then, and wait still."""
+    statement = select(JobRow).where(JobRow.state == "queued", _ready(now), JobRow.sent_at <= sent_before)
+    return session.scalars(statement.order_by(JobRow.sent_at, JobRow.id).limit(limit)).all()
+
+
+def neglected_queues(session: Session, queues: Sequence[str], sent_before: datetime, now: datetime) -> list[str]:
+    """Those of the queues in which a job waits that was given to a carrier before then."""
+    statement = select(JobRow.queue).where(_waiting(queues, now), JobRow.sent_at <= sent_before)
+    return list(session.scalars(statement.distinct()))
 
 
 def mark_sent(session: Session, job_id: UUID, now: datetime) -> None:
@@ -55,9 +66,38 @@ def mark_sent(session: Session, job_id: UUID, now: datetime) -> None:
 
 
 def counts_by_state(session: Session) -> Sequence[tuple[str, str, int]]:
-    """(queue, state, number of jobs)."""
-    statement = select(JobRow.queue, JobRow.state, func.count()).group_by(JobRow.queue, JobRow.state)
+    """(queue, state, number of jobs); canaries apart."""
+    statement = select(JobRow.queue, JobRow.state, func.count()).where(JobRow.kind != "canary")
+    statement = statement.group_by(JobRow.queue, JobRow.state)
     return [(queue, state, count) for queue, state, count in session.execute(statement)]
+
+
+def canaries(session: Session) -> Sequence[JobRow]:
+    """The canaries of all queues."""
+    return session.scalars(select(JobRow).where(JobRow.kind == "canary", JobRow.project_id.is_(None))).all()
+
+
+def ended_canaries(session: Session, before: datetime) -> Sequence[JobRow]:
+    """Canaries that ended before then, locked; those that another process has in hand are passed over."""
+    ended = JobRow.state.in_(("done", "failed", "cancelled"))
+    statement = select(JobRow).where(
+        JobRow.kind == "canary", JobRow.project_id.is_(None), ended, JobRow.finished_at <= before
+    )
+    return session.scalars(statement.with_for_update(skip_locked=True)).all()
+
+
+def queues_at_work(session: Session, now: datetime) -> set[str]:
+    """Queues served by a worker that holds a job under a live lease."""
+    statement = select(WorkerRow.queues).join(JobRow, JobRow.owner == WorkerRow.owner)
+    statement = statement.where(JobRow.state == "running", JobRow.lease_until > now, JobRow.kind != "canary")
+    return {str(queue) for queues in session.scalars(statement) for queue in queues}
+
+
+def held_by_process(session: Session, host: str, pids: Sequence[int], now: datetime) -> bool:
+    """True where one of these processes holds a job under a live lease."""
+    mine = or_(*(JobRow.owner.startswith(f"{host}:{pid}:", autoescape=True) for pid in pids)) if pids else false()
+    statement = select(JobRow.id).where(JobRow.state == "running", JobRow.lease_until > now, mine)
+    return session.scalar(statement.limit(1)) is not None
 
 
 def live_workers(session: Session, since: datetime) -> int:

@@ -3,19 +3,29 @@
 from collections.abc import Sequence
 from uuid import UUID
 
+import sqlalchemy
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from service.store.queries.segments import Segment, among, parts
 from service.store.tables import LabelRow
 
 
-def label_of(session: Session, project_id: UUID, trajectory: str, start: int) -> LabelRow | None:
-    """The label of a segment."""
-    return session.scalar(
-        select(LabelRow).where(
-            LabelRow.project_id == project_id, LabelRow.trajectory_id == trajectory, LabelRow.start == start
-        )
-    )
+def labels_of(session: Session, project_id: UUID, segments: Sequence[Segment]) -> dict[Segment, LabelRow]:
+    """Labels by segment, of those that have one."""
+    found: dict[Segment, LabelRow] = {}
+    for some in parts(segments):
+        named = among(session, LabelRow.trajectory_id, LabelRow.start, some)
+        rows = session.scalars(select(LabelRow).where(LabelRow.project_id == project_id, named))
+        found |= {(row.trajectory_id, row.start): row for row in rows}
+    return found
+
+
+def insert(session: Session, rows: Sequence[LabelRow]) -> None:
+    """Write new labels; a third of the time that the unit of work takes for as many objects."""
+    columns = [column.key for column in LabelRow.__table__.columns]
+    values = [{column: getattr(row, column) for column in columns} for row in rows]
+    session.execute(sqlalchemy.insert(LabelRow), values)
 
 
 def labels_up_to(session: Session, project_id: UUID, split: str, watermark: int) -> Sequence[LabelRow]:

@@ -13,29 +13,17 @@ from service.store.tables import ClaimRow, LabelRow, MembershipRow, ProjectRow, 
 
 
 @dataclass(frozen=True)
-class SplitCount:
-    """Trajectories and segments of one split; live leases and labels among them."""
+class Member:
+    """A trajectory of a split, as much of it as a draw needs."""
 
-    trajectories: int
+    trajectory_id: str
     segments: int
-    leased: int
-    labeled: int
-
-    @property
-    def free(self) -> int:
-        """Segments that are neither leased nor labeled."""
-        return self.segments - self.leased - self.labeled
 
 
-def split_count(session: Session, project_id: UUID, split: str, now: datetime) -> SplitCount:
-    """Counts of one split at `now`."""
-    members = select(func.count(), func.coalesce(func.sum(MembershipRow.segments), 0)).where(
-        MembershipRow.project_id == project_id, MembershipRow.split == split
-    )
-    trajectories, segments = session.execute(members).one()
-    leased = _count(session, live_claim(now), ClaimRow.project_id == project_id, ClaimRow.purpose == split)
-    labeled = _count(session, LabelRow.project_id == project_id, LabelRow.split == split)
-    return SplitCount(trajectories, int(segments), leased, labeled)
+def leased(session: Session, project_id: UUID, split: str, now: datetime) -> int:
+    """Segments of a split under a live lease."""
+    where = (live_claim(now), ClaimRow.project_id == project_id, ClaimRow.purpose == split)
+    return session.scalar(select(func.count()).where(*where)) or 0
 
 
 def live_claim(now: datetime) -> ColumnElement[bool]:
@@ -62,6 +50,26 @@ def memberships(
     if last is not None:
         statement = statement.where(MembershipRow.id <= last)
     return session.scalars(statement.order_by(MembershipRow.id)).all()
+
+
+def members(session: Session, project_id: UUID, split: str, *, with_provenance: bool = False) -> list[Member]:
+    """Members of a split in the order they came, by two columns; with_provenance: only those with simulator states."""
+    statement = select(MembershipRow.trajectory_id, MembershipRow.segments).where(
+        MembershipRow.project_id == project_id, MembershipRow.split == split
+    )
+    if with_provenance:
+        statement = statement.where(MembershipRow.provenance_sha256.is_not(None))
+    return [Member(name, segments) for name, segments in session.execute(statement.order_by(MembershipRow.id))]
+
+
+def memberships_of(session: Session, project_id: UUID, trajectory_ids: Sequence[str]) -> dict[str, MembershipRow]:
+    """Memberships in the project by trajectory, of those that are members."""
+    found: dict[str, MembershipRow] = {}
+    for i in range(0, len(trajectory_ids), 500):
+        named = MembershipRow.trajectory_id.in_(trajectory_ids[i : i + 500])
+        rows = session.scalars(select(MembershipRow).where(MembershipRow.project_id == project_id, named))
+        found |= {row.trajectory_id: row for row in rows}
+    return found
 
 
 def newest_membership(session: Session, project_id: UUID, split: str) -> int:
@@ -113,7 +121,3 @@ def taken_starts(session: Session, project_id: UUID, split: str, now: datetime) 
         for trajectory, start in session.execute(statement):
             taken.setdefault(trajectory, set()).add(start)
     return taken
-
-
-def _count(session: Session, *where: ColumnElement[bool]) -> int:
-    return session.scalar(select(func.count()).where(*where)) or 0

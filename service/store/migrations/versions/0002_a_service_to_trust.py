@@ -11,7 +11,12 @@ branch_labels = None
 depends_on = None
 
 COUNTERS = ("pool_trajectories", "pool_segments", "held_out_trajectories", "held_out_segments", "held_out_labels")
-TEXTS = (("event", "actor", 200), ("event", "correlation", 100), ("job", "correlation", 100), ("acquisition", "mode", 10))
+TEXTS = (
+    ("event", "actor", 200),
+    ("event", "correlation", 100),
+    ("job", "correlation", 100),
+    ("acquisition", "mode", 10),
+)
 
 
 def upgrade() -> None:
@@ -28,6 +33,7 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("caller", "route", "key", name=op.f("pk_idempotency")),
     )
     op.create_index(op.f("ix_idempotency_expires_at"), "idempotency", ["expires_at"])
+    op.create_index("ix_acquisition_expiry", "acquisition", ["status", "lease_expires_at"])
     op.create_index("ix_membership_split", "membership", ["project_id", "split", "id"])
     _add_nullable()
     _fill()
@@ -37,7 +43,9 @@ def upgrade() -> None:
 def downgrade() -> None:
     op.execute("DELETE FROM job WHERE project_id IS NULL")
     op.execute("DELETE FROM claim WHERE purpose = 'explore'")
-    op.execute("DELETE FROM acquisition_item WHERE acquisition_id IN (SELECT id FROM acquisition WHERE mode = 'explore')")
+    op.execute(
+        "DELETE FROM acquisition_item WHERE acquisition_id IN (SELECT id FROM acquisition WHERE mode = 'explore')"
+    )
     op.execute("DELETE FROM acquisition WHERE mode = 'explore'")
     op.execute("UPDATE acquisition SET status = 'leased' WHERE status = 'expired'")
     op.execute("UPDATE job SET state = 'failed' WHERE state = 'cancelled'")
@@ -58,6 +66,7 @@ def downgrade() -> None:
     with op.batch_alter_table("project") as table:
         for name in COUNTERS:
             table.drop_column(name)
+    op.drop_index("ix_acquisition_expiry", table_name="acquisition")
     op.drop_index("ix_membership_split", table_name="membership")
     op.drop_index(op.f("ix_idempotency_expires_at"), table_name="idempotency")
     op.drop_table("idempotency")
@@ -78,7 +87,7 @@ def _add_nullable() -> None:
 def _fill() -> None:
     """The counters of what is there; whoever did it before is not known."""
     for split in ("pool", "held_out"):
-        members = f"FROM membership m WHERE m.project_id = project.id AND m.split = '{split}'"  # noqa: S608  # our names
+        members = f"FROM membership m WHERE m.project_id = project.id AND m.split = '{split}'"  # our names
         op.execute(f"UPDATE project SET {split}_trajectories = (SELECT count(*) {members})")  # noqa: S608
         op.execute(f"UPDATE project SET {split}_segments = (SELECT coalesce(sum(m.segments), 0) {members})")  # noqa: S608
     labels = "SELECT count(*) FROM label WHERE label.project_id = project.id AND label.split = 'held_out'"

@@ -1,0 +1,78 @@
+"""Draws by chance: held-out segments, and states to explore from. Seeded by the project and its last lease's token."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy.orm import Session
+
+from api_schemas.environments import DiscreteActions
+from api_schemas.labels import Action
+from service import projects
+from service.store.queries import pool as queries
+from service.store.tables import ProjectRow
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A segment about to be given out, or a state and the actions to execute there."""
+
+    trajectory: str
+    start: int
+    score: float | None = None
+    actions: Sequence[Action] | None = None
+
+
+def held_out(session: Session, project: ProjectRow, count: int, now: datetime) -> list[Candidate]:
+    """`count` of the free held-out segments, uniformly."""
+    taken = queries.taken_starts(session, project.id, "held_out", now)
+    members = queries.members(session, project.id, "held_out")
+    ends = np.cumsum([member.segments for member in members])
+    busy = [
+        before + start // project.stride
+        for member, before in zip(members, [0, *ends[:-1].tolist()], strict=True)
+        for start in taken.get(member.trajectory_id, ())
+    ]
+    free = np.delete(np.arange(ends[-1]), busy)
+    chosen = _generator(project).choice(free, count, replace=False)
+    return [Candidate(*_segment(project, members, ends, int(place))) for place in chosen]
+
+
+def explorations(session: Session, project: ProjectRow, count: int) -> list[Candidate]:
+    """`count` observations of the pool and a segment's worth of actions for each, both uniform; fewer for no pool.
+
+    Where the project has a simulator only trajectories whose simulator states are kept can be gone back to.
+    """
+    simulated = projects.environment_of(project).simulator is not None
+    members = queries.members(session, project.id, "pool", with_provenance=simulated)
+    ends = np.cumsum([member.segments for member in members])
+    if not len(ends) or not ends[-1]:
+        return []
+    rng = _generator(project)
+    places = rng.integers(0, ends[-1], count)
+    return [
+        Candidate(*_segment(project, members, ends, int(place)), actions=_actions(project, rng)) for place in places
+    ]
+
+
+def _segment(
+    project: ProjectRow, members: Sequence[queries.Member], ends: NDArray[np.int64], place: int
+) -> tuple[str, int]:
+    """Trajectory and start of the segment at this place of the split."""
+    number = int(np.searchsorted(ends, place, side="right"))
+    before = int(ends[number]) - members[number].segments
+    return members[number].trajectory_id, (place - before) * project.stride
+
+
+def _actions(project: ProjectRow, rng: np.random.Generator) -> list[Action]:
+    space = projects.spaces_of(project).actions
+    if isinstance(space, DiscreteActions):
+        return [int(action) for action in rng.integers(0, space.n, project.segment_length)]
+    size = (project.segment_length, int(np.prod(space.shape)))
+    return [[float(value) for value in row] for row in rng.uniform(space.low, space.high, size)]
+
+
+def _generator(project: ProjectRow) -> np.random.Generator:
+    return np.random.default_rng([project.seed, project.token])

@@ -1,0 +1,41 @@
+"""Idempotency: the answer to a request with an Idempotency-Key is kept, in the transaction of what the request did."""
+
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+
+from sqlalchemy.orm import Session
+
+from service.errors import IdempotencyKeyReused
+from service.store.queries import idempotency as queries
+from service.store.tables import IdempotencyRow
+
+
+@dataclass(frozen=True)
+class KeyUse:
+    """One use of a key: who sent which request under it. Two callers may use the same key."""
+
+    caller: str
+    route: str
+    key: str
+    request_sha256: str
+
+
+def begin(session: Session, use: KeyUse, now: datetime, keep: timedelta) -> IdempotencyRow:
+    """The kept answer (its `status` is set), or a new row for `finish` to fill or `forget` to remove.
+
+    Where the same key is in use at this moment, this waits for the other's end. Raises IdempotencyKeyReused.
+    """
+    row = queries.insert_or_find(session, use.caller, use.route, use.key, use.request_sha256, now, now + keep)
+    if row.request_sha256 != use.request_sha256:
+        raise IdempotencyKeyReused(use.key, use.route)
+    return row
+
+
+def finish(row: IdempotencyRow, status: int, location: str | None, body: str) -> None:
+    """Keep the answer."""
+    row.status, row.location, row.body = status, location, body
+
+
+def forget(session: Session, row: IdempotencyRow) -> None:
+    """The request changed nothing that a repetition would do twice."""
+    session.delete(row)

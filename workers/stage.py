@@ -1,0 +1,132 @@
+"""One network's training inside a job: in slices, with checkpoints from which another worker goes on, bit for bit."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from uuid import UUID
+
+import torch
+from sqlalchemy.orm import Session
+
+from models.network import Network
+from models.segments import SegmentBatch
+from models.training import TrainingConfig, TrainingState, advance, begin
+from service import events, jobs
+from service.errors import ServiceError
+from service.log import get_logger
+from service.store.tables import JobRow
+from workers.job import GaveWay, RunningJob
+
+log = get_logger("worker")
+FIRST_STEPS = 5  # of a slice; the later ones follow the time that it took
+SLICE_SECONDS = 1.0  # between two looks at whether the job is to stop; a slice itself costs less than a hundredth
+Tell = Callable[[int, int, float], None]  # step, steps, loss
+
+
+class Stage:
+    """The training of one network of a job. Only the stage of this name takes up a checkpoint of this name."""
+
+    def __init__(self, job: RunningJob, name: str, round_id: UUID | None) -> None:
+        self._job, self._name, self._round = job, name, round_id
+        self._stored = 0  # the step of the newest checkpoint
+
+    def train(
+        self, network: Network, batch: SegmentBatch, config: TrainingConfig, generator: torch.Generator, tell: Tell
+    ) -> TrainingState:
+        """Train to the end of the schedule, from where an earlier attempt left off. Raises GaveWay, JobLost.
+
+        The weights are those of one uninterrupted run, however it is cut. `tell` may raise to stop it.
+        """
+        state = self._resumed(config) or begin(network, config, generator)
+        steps, loss, saved = FIRST_STEPS, [0.0], time.monotonic()
+        self._stored = state.step
+        while state.step < config.steps:
+            started = time.monotonic()
+            if started - saved >= self._job.worker.settings.checkpoint_seconds:
+                self._store(state)
+                saved = started
+            until = min(state.step + steps, config.steps)
+            state = advance(network, batch, state, until, progress=lambda *now: loss.append(now[-1]))
+            steps = _next_steps(steps, time.monotonic() - started)
+            self._look_up(state, loss[-1], tell)
+        return state
+
+    @contextmanager
+    def finished(self) -> Iterator[Session]:
+        """The transaction that stores the stage's result; its checkpoint goes with it. Raises JobLost."""
+        with self._job.transaction() as session:
+            yield session
+            row = session.get_one(JobRow, self._job.lease.job_id)
+            left, row.checkpoint_sha256, row.checkpoint_stage = row.checkpoint_sha256, None, None
+        self._discard(left)
+
+    def _look_up(self, state: TrainingState, loss: float, tell: Tell) -> None:
+        """Tell how far it is; where the job is to stop here, what was done is kept."""
+        try:
+            tell(state.step, state.config.steps, loss)
+            self._let_others_go_first(state)
+        except GaveWay:
+            self._store(state)
+            raise
+
+    def _let_others_go_first(self, state: TrainingState) -> None:
+        if state.step < state.config.steps and self._job.should_give_way():
+            raise GaveWay(f"other work waits at step {state.step} of {state.config.steps} of {self._name}")
+
+    def _resumed(self, config: TrainingConfig) -> TrainingState | None:
+        """The state that an earlier attempt left, if it is whole and of this schedule."""
+        with self._job.worker.database.read() as session:
+            row = session.get_one(JobRow, self._job.lease.job_id)
+        if row.checkpoint_sha256 is None or row.checkpoint_stage != self._name:
+            return None
+        try:
+            state = TrainingState.from_bytes(self._job.worker.blobs.get("checkpoints", row.checkpoint_sha256))
+        except (ServiceError, ValueError) as error:
+            log.warning("checkpoint_unusable", stage=self._name, error=str(error))
+            return None
+        if state.config != config:
+            log.warning("checkpoint_of_another_schedule", stage=self._name, found=str(state.config))
+            return None
+        self._tell_of_resuming(row, state.step)
+        return state
+
+    def _tell_of_resuming(self, row: JobRow, step: int) -> None:
+        round_id = None if self._round is None else str(self._round)
+        data: dict[str, object] = {"job": str(row.id), "round": round_id, "stage": self._name, "step": step}
+        with self._job.transaction() as session:
+            events.record(session, row.project_id, "training.resumed", data, self._job.now())
+        log.info("training_resumed", stage=self._name, step=step)
+
+    def _store(self, state: TrainingState) -> None:
+        """Replace the checkpoint by one that is further; that is progress, so attempts count anew."""
+        if state.step <= self._stored:
+            return
+        sha256 = self._job.worker.blobs.put("checkpoints", _own(self._job.lease.job_id, state).to_bytes())
+        with self._job.transaction() as session:
+            row = session.get_one(JobRow, self._job.lease.job_id)
+            replaced, row.checkpoint_sha256, row.checkpoint_stage = row.checkpoint_sha256, sha256, self._name
+            jobs.made_progress(session, self._job.lease)
+        self._stored = state.step
+        if replaced != sha256:
+            self._discard(replaced)
+
+    def _discard(self, sha256: str | None) -> None:
+        if sha256 is None:
+            return
+        try:
+            self._job.worker.blobs.delete("checkpoints", sha256)
+        except (ServiceError, OSError) as error:  # nothing refers to it any more: it only takes up room
+            log.warning("checkpoint_not_deleted", sha256=sha256, error=str(error))
+
+
+def _own(job_id: UUID, state: TrainingState) -> TrainingState:
+    """The state under the job's name: equal states of two jobs are two blobs, and deleting one keeps the other."""
+    name = torch.tensor(list(job_id.bytes), dtype=torch.uint8)
+    return replace(state, tensors={**state.tensors, "job": name})
+
+
+def _next_steps(steps: int, seconds: float) -> int:
+    """About SLICE_SECONDS of them, approached by doubling."""
+    fitting = int(steps * SLICE_SECONDS / max(seconds, 1e-6))
+    return max(1, min(2 * steps, fitting))
