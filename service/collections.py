@@ -12,7 +12,7 @@ from service.errors import InvalidField, NoSimulator, UnknownBehavior
 from service.store.tables import JobRow, ProjectRow
 
 
-def request(session: Session, asked: CollectionCreate, now: datetime, max_attempts: int = 5) -> JobRow:
+def request(session: Session, asked: CollectionCreate, now: datetime, max_attempts: int = 3) -> JobRow:
     """The job that collects. Raises UnknownResource, NoSimulator, UnknownBehavior, InvalidField."""
     project = projects.find(session, asked.project)
     simulator = projects.environment_of(project).simulator

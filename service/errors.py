@@ -92,6 +92,15 @@ class MissingBlob(ServiceError):
         super().__init__(f"blob {key} is not in the store")
 
 
+class BlobsUnavailable(ServiceError):
+    """The blob store is unavailable."""
+
+    status_code = 503
+
+    def __init__(self, key: str, reason: str) -> None:
+        super().__init__(f"blob {key}: its store did not do what was asked; nothing was stored, try again: {reason}")
+
+
 class NameTaken(ServiceError):
     """Another project has this name."""
 

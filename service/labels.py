@@ -76,7 +76,7 @@ class _Batch:
 
 
 def accept(
-    session: Session, request: LabelsRequest, uploads: Sequence[LabeledUpload], now: datetime, max_attempts: int = 5
+    session: Session, request: LabelsRequest, uploads: Sequence[LabeledUpload], now: datetime, max_attempts: int = 3
 ) -> LabelsAccepted:
     """Store all labels or none, in the caller's transaction, and ask for a round when enough have come.
 

@@ -16,7 +16,7 @@ from service.store.queries import rows
 from service.store.tables import ModelVersionRow, ProjectRow, RoundRow
 
 
-def request(session: Session, project: ProjectRow, now: datetime, max_attempts: int = 5) -> RoundRow:
+def request(session: Session, project: ProjectRow, now: datetime, max_attempts: int = 3) -> RoundRow:
     """A round on all labels that are there now, and its job. Raises NothingToLearn, NoModelFamily.
 
     Asked for twice on the same labels it is one round; one that still waits for a worker gives way to a newer one.

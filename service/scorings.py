@@ -28,7 +28,7 @@ class Limits:
 
     queue_length: int
     shard_segments: int
-    max_attempts: int = 5
+    max_attempts: int = 3
 
 
 def limits_of(settings: Settings) -> Limits:

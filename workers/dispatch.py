@@ -20,7 +20,7 @@ from api_schemas.jobs import (
     TrainSubgoalGenerator,
 )
 from service import canary, jobs, origin, reaper
-from service.errors import JobLost
+from service.errors import BlobsUnavailable, JobLost
 from service.log import get_logger
 from service.settings import Settings
 from service.store.blobs import Blobs
@@ -29,7 +29,12 @@ from service.store.tables import JobRow
 from workers.job import GaveWay, Heartbeat, RunningJob, Worker
 
 log = get_logger("worker")
-TRANSIENT = (OSError, SQLAlchemyError, MemoryError)  # another attempt may succeed; anything else would fail again
+TRANSIENT = (
+    OSError,
+    SQLAlchemyError,
+    MemoryError,
+    BlobsUnavailable,
+)  # another attempt may succeed; anything else would fail again
 Result = dict[str, object]
 
 

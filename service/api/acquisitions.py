@@ -37,7 +37,10 @@ async def acquire(
     answer = await run_in_threadpool(_acquired, held, request, use)
     while answer.status == 202 and time.monotonic() < deadline:  # no thread and no transaction is held meanwhile
         await anyio.sleep(POLL_SECONDS)
-        if await run_in_threadpool(_is_over, held, AcquisitionPending.model_validate_json(answer.body).job):
+        state = await run_in_threadpool(_state, held, AcquisitionPending.model_validate_json(answer.body).job)
+        if state in ("failed", "cancelled"):
+            break  # who asked learns of it from the job that the answer names, and may ask again
+        if state == "done":
             answer = await run_in_threadpool(_acquired, held, request, use)
     response = answer.response()
     if wait_seconds(prefer):
@@ -84,6 +87,6 @@ def _pending(job: JobRow) -> Answer:
     return Answer(202, body.model_dump_json(), f"/jobs/{job.id}", {"Retry-After": "1"})
 
 
-def _is_over(held: Services, job_id: UUID) -> bool:
+def _state(held: Services, job_id: UUID) -> str:
     with held.database.read() as session:
-        return jobs.find(session, job_id).finished_at is not None
+        return jobs.find(session, job_id).state

@@ -5,7 +5,6 @@ from http import HTTPStatus
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from obstore.exceptions import BaseError
 from sqlalchemy.exc import DataError, InterfaceError, OperationalError, TimeoutError  # noqa: A004  (of the pool)
 from starlette.exceptions import HTTPException
 
@@ -14,6 +13,7 @@ from service.errors import BodyTooLarge, ServiceError
 from service.log import get_logger
 
 log = get_logger("api")
+HEADERS = {401: {"WWW-Authenticate": "Bearer"}, 503: {"Retry-After": "5"}}  # what a status says beside its body
 
 
 def install(app: FastAPI) -> None:
@@ -24,7 +24,6 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(DataError, _unstorable)
     for unavailable in (OperationalError, InterfaceError, TimeoutError):
         app.add_exception_handler(unavailable, _database_error)
-    app.add_exception_handler(BaseError, _storage_error)
     app.add_exception_handler(Exception, _unexpected)
 
 
@@ -37,8 +36,7 @@ def answer(problem: Problem, headers: dict[str, str] | None = None) -> JSONRespo
 def _service_error(request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, ServiceError):
         raise error
-    headers = {"WWW-Authenticate": "Bearer"} if error.status_code == HTTPStatus.UNAUTHORIZED else None
-    return answer(error.problem(request.url.path), headers)
+    return answer(error.problem(request.url.path), HEADERS.get(error.status_code))
 
 
 def _malformed(request: Request, error: Exception) -> JSONResponse:
@@ -77,14 +75,6 @@ def _database_error(request: Request, error: Exception) -> JSONResponse:
     detail = "the database did not answer in time; nothing was stored, try again"
     return answer(
         _problem("database-unavailable", 503, "The database is unavailable", detail, request), {"Retry-After": "1"}
-    )
-
-
-def _storage_error(request: Request, error: Exception) -> JSONResponse:
-    log.error("storage_error", path=request.url.path, error=str(error))
-    detail = "the blob store could not be read or written; nothing was stored, try again"
-    return answer(
-        _problem("storage-unavailable", 503, "The blob store is unavailable", detail, request), {"Retry-After": "5"}
     )
 
 

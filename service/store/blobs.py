@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, MemoryStore, S3Store, from_url
 
-from service.errors import CorruptBlob, MissingBlob, ServiceError
+from service.errors import BlobsUnavailable, CorruptBlob, MissingBlob
 from service.log import get_logger
 
 if TYPE_CHECKING:
@@ -26,15 +26,6 @@ if TYPE_CHECKING:
 log = get_logger("store")
 # obstore's own would keep a request waiting for three minutes; here who asks is told soon, and asks again.
 RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=10)}
-
-
-class BlobsUnavailable(ServiceError):
-    """The blob store is unavailable."""
-
-    status_code = 503
-
-    def __init__(self, key: str, reason: str) -> None:
-        super().__init__(f"blob {key}: its store did not do what was asked; nothing was stored, try again: {reason}")
 
 
 class Blobs:

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from uuid import UUID
 
@@ -19,7 +19,7 @@ from service.store.database import open_database
 from service.store.tables import JobRow
 from tests.loop.invariants import Acknowledged, check_invariants
 from tests.loop.processes import command_of, environment, eventually, free_port
-from tests.loop.rows import check_rows, snapshot
+from tests.loop.rows import Segment, check_rows, labels_of, segments_of, snapshot
 from tests.private_servers import PrivateRedis
 
 SCIENCE = "train,score,default"
@@ -188,6 +188,13 @@ class Deployment:
         check_invariants(
             self.client, self.folder, acknowledged, database_url=self.database_url, exact=True, ended=ended or []
         )
+
+    def lost_or_doubled(self, acknowledged: Mapping[UUID, Iterable[Segment]]) -> int:
+        """Labels that were acknowledged and are not there, and labels that are there twice."""
+        with self.database.read() as session:
+            found = {project: segments_of(labels_of(session, project)) for project in acknowledged}
+        lost = sum(len(set(told) - set(found[project])) for project, told in acknowledged.items())
+        return lost + sum(count - 1 for labels in found.values() for count in labels.values())
 
     def last_words(self) -> str:
         """The ends of all logs."""

@@ -48,7 +48,7 @@ class Labelers:
                 answer = self._http.post(path, json=request, headers={"Idempotency-Key": key})
             except httpx.TransportError:
                 self.unanswered += 1
-                time.sleep(0.05)
+                time.sleep(0.2)
                 continue
             if answer.status_code == 503:
                 self._check_unavailable(answer)

@@ -79,11 +79,13 @@ class Scene:
         self._hammer.finish()
         self.deployment.await_rest()
         labeled = {each.id: self._prepared.labeled[each.name] for each in self.deployment.client.projects()}
-        self.deployment.check(labeled | {self._busy: [*labeled[self._busy], *self._hammer.acknowledged]})
+        labeled |= {self._busy: [*labeled[self._busy], *self._hammer.acknowledged]}
+        self.deployment.check(labeled)
         compared = self.rounds.check_networks()
         self.figures.add("strikes", len(self.recovered), f"at {seconds:.1f} s each")
         self.figures.add("rounds with the same networks, bit for bit", compared, "rounds")
         self.figures.add("labels acknowledged meanwhile", len(self._hammer.acknowledged), "labels")
+        self.figures.none("labels lost or doubled", self.deployment.lost_or_doubled(labeled))
         self.figures.add("trainings resumed from a checkpoint", self.resumed(), "times")
         self.figures.add("longest time until another has the job", max(self.recovered), "s", RECOVERED, "below")
 

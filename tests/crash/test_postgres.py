@@ -47,6 +47,7 @@ def test_8_an_upload_that_a_restart_interrupts_is_whole_or_not_there(
         ask_again(deployment.url, deployment.key, hammer.labelers.answers[-10:])
     deployment.check(told)
     figures.note(f"PostgreSQL ended by {', '.join(f'{name} {count} times' for name, count in sorted(done.items()))}")
+    figures.none("labels lost or doubled", deployment.lost_or_doubled(told))
     figures.add("labels acknowledged", sum(len(each.acknowledged) for each in hammers.values()), "labels")
     unavailable = sum(each.labelers.unavailable for each in hammers.values())
     figures.add("answers 503 with Retry-After", unavailable, "answers", target=1)

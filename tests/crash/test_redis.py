@@ -43,11 +43,13 @@ def test_6_what_redis_forgets_comes_back_from_the_database(
     seconds = (time.monotonic() - began) / REPEAT
     hammer.finish()
     deployment.await_rest()
-    deployment.check(_told(prepared, names, {busy: hammer}))
+    told = _told(prepared, names, {busy: hammer})
+    deployment.check(told)
     figures.note(f"Redis was {', '.join(f'{what} {count} times' for what, count in sorted(done.items()))}")
     figures.add("disturbances", REPEAT, f"at {seconds:.1f} s each")
     figures.add("answers of /acquire and /labels meanwhile", len(hammer.labelers.answers), "answers")
     figures.none("requests refused or unanswered", hammer.labelers.unanswered + hammer.labelers.unavailable)
+    figures.none("labels lost or doubled", deployment.lost_or_doubled(told))
     figures.add("longest time until canaries pass", max(canaries), "s", target=CANARY_SECONDS, better="below")
     figures.note(f"workers were started {sum(each.starts for each in deployment.workers)} times")
 

@@ -3,6 +3,7 @@
 import random
 import signal
 import time
+from collections import Counter
 from uuid import UUID
 
 import numpy as np
@@ -35,6 +36,7 @@ def test_4_a_scorer_killed_half_way(
     undisturbed = _scored(deployment, start_scoring(deployment, project))
     assert undisturbed.segments == segments_of_pool(deployment, project)
     recovered, began = list[float](), time.monotonic()
+    missing = doubled = different = 0
     while len(recovered) < REPEAT:
         scoring = start_scoring(deployment, project)
         if not _killed(deployment, scoring, chance):
@@ -42,15 +44,19 @@ def test_4_a_scorer_killed_half_way(
         killed = time.monotonic()
         scores = _scored(deployment, scoring)
         recovered.append(time.monotonic() - killed)
+        counted, wanted = Counter(scores.segments), Counter(undisturbed.segments)
+        missing, doubled = missing + (wanted - counted).total(), doubled + (counted - wanted).total()
         assert scores.segments == undisturbed.segments
-        assert np.array_equal(scores.scores.view(np.uint32), undisturbed.scores.view(np.uint32)), "other scores"
+        different += int(np.sum(scores.scores.view(np.uint32) != undisturbed.scores.view(np.uint32)))
         assert len(jobs_of(deployment, scoring, "merge_scores")) == 1
         deployment.check_rows()
     seconds = (time.monotonic() - began) / REPEAT
     deployment.await_rest()
     deployment.check({each.id: prepared.labeled[each.name] for each in projects})
     figures.add("scorers killed", REPEAT, f"at {seconds:.1f} s each")
-    figures.none("scores missing, doubled or different", 0)  # each scoring was compared above
+    figures.none("scores missing", missing)
+    figures.none("scores there twice", doubled)
+    figures.none("scores that differ in any bit", different)
     figures.add("longest time from a kill to the merged scores", max(recovered), "s", target=60, better="below")
 
 

@@ -23,7 +23,7 @@ from tests.figures import Figures
 from tests.loop.processes import eventually
 from tests.scale.conftest import Deploy
 
-POOL, TRANSITIONS, SHARD = 300_000, 2500, 25_000  # segments; of a trajectory; segments of a shard
+POOL, TRANSITIONS, SHARD = 200_000, 2500, 12_500  # segments; of a trajectory; segments of a shard
 LABELS_PER_ACTION = 2
 REPEATS, TARGET = 3, 1.7
 COLLECT_SECONDS, ROUND_SECONDS, SCORE_SECONDS = 120.0, 180.0, 300.0

@@ -2,6 +2,7 @@
 
 import io
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -138,6 +139,21 @@ class Served:
         """POST /labels, under the batch's lease where one is given."""
         lease = {} if batch is None else {"acquisition": batch["id"], "token": batch["token"]}
         return self.client.post("/labels", json={"project": project, "items": list(items)} | lease | fields)
+
+    def another_client(self) -> TestClient:
+        """A client for a thread of its own."""
+        return TestClient(self.app, base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
+
+    def events(self, project: str) -> list[Json]:
+        """All events of a project; on PostgreSQL the last are shown once no older transaction is open on the server."""
+        newest = self.get("/events", project=project, newest=True, limit=1)["items"][0]["id"]
+        deadline = time.monotonic() + 20
+        while True:
+            items: list[Json] = self.get("/events", project=project, limit=1000)["items"]
+            if items and items[-1]["id"] >= newest:
+                return items
+            assert time.monotonic() < deadline, f"event {newest} is not listed"
+            time.sleep(0.02)
 
     def close(self) -> None:
         """Give back all connections."""
