@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONSAFEPATH := 1
 SEED ?= 0
+REPEAT ?= 50
 
 .PHONY: help setup system demo serve test test-slow lint types imports format bench-acquire bench-score clean
 .DEFAULT_GOAL := help
@@ -33,8 +34,9 @@ test: setup lint types imports ## what CI runs: lint, types, import contracts, t
 	scripts/system-packages all
 	$(BIN)/python -m pytest
 
-test-slow: setup ## the long tests: crashes at random moments
-	$(BIN)/python -m pytest -m slow
+test-slow: setup ## the long tests: kills at random moments, scale (REPEAT=5 shortens the kills; ASIM_TEST_SEED=n repeats)
+	scripts/system-packages all
+	REPEAT=$(REPEAT) $(BIN)/python -m pytest -m slow
 
 lint: setup ## ruff
 	$(BIN)/ruff check .

@@ -3,7 +3,7 @@
 from typing import Literal
 from uuid import UUID
 
-from pydantic import Base64Bytes, Field, StrictInt
+from pydantic import Base64Bytes, Field, StrictInt, model_validator
 
 from api_schemas.base import Schema, Split, Timestamp, TrajectoryId
 from api_schemas.trajectories import SplitChoice
@@ -46,6 +46,12 @@ class LabeledTrajectory(Schema):
     starts: list[int] | None = None
     split: SplitChoice = "auto"
     rank: int | None = Field(default=None, ge=0)
+
+    @model_validator(mode="after")
+    def _exploration_trains(self) -> "LabeledTrajectory":
+        if self.rank is not None and self.split == "held_out":
+            raise ValueError("split: 'held_out' cannot answer an exploration: what it finds is trained on")
+        return self
 
 
 class LabelsRequest(Schema):

@@ -38,7 +38,7 @@ def answer(
     if claim is None:
         raise LeaseLost(acquisition.id, _why(acquisition.id, item))
     item.answer = trajectory
-    session.delete(claim)
+    queries.drop_claims(session, project.id, [place])
     events.record(session, project.id, "exploration.answered", {"acquisition": str(acquisition.id), "rank": rank}, now)
     return claim.expires_at > now
 

@@ -5,6 +5,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from typing import Literal
 from uuid import uuid4
 
 from sqlalchemy.orm import Session
@@ -35,8 +36,11 @@ from service.pool import StoredTrajectory
 from service.store.queries import acquisitions as claim_queries
 from service.store.queries import labels as queries
 from service.store.queries import pool as pool_queries
+from service.store.queries.acquisitions import Claim
+from service.store.queries.labels import StoredLabel
+from service.store.queries.pool import Membership
 from service.store.queries.segments import Segment
-from service.store.tables import AcquisitionRow, ClaimRow, LabelRow, MembershipRow, ProjectRow
+from service.store.tables import AcquisitionRow, LabelRow, ProjectRow
 
 
 @dataclass(frozen=True)
@@ -63,15 +67,16 @@ class _Batch:
     """
 
     project: ProjectRow
-    source: LabelSource
+    watermark: int
+    source: dict[str, object]
     acquisition: AcquisitionRow | None
     now: datetime
-    members: dict[str, MembershipRow]
-    labels: dict[Segment, LabelRow]
-    claims: dict[Segment, ClaimRow]
+    members: dict[str, Membership]
+    labels: dict[Segment, StoredLabel]
+    claims: dict[Segment, Claim]
     explored: frozenset[Segment]
     receipts: list[LabelReceipt] = field(default_factory=list)
-    created: list[LabelRow] = field(default_factory=list)
+    created: list[dict[str, object]] = field(default_factory=list)
     unreserved: int = 0
 
 
@@ -164,7 +169,8 @@ def _batch(
     segments = [(item.trajectory, item.start) for item in items]
     return _Batch(
         project=project,
-        source=source,
+        watermark=project.label_watermark,
+        source=source.model_dump(mode="json"),
         acquisition=acquisition,
         now=now,
         members=members,
@@ -180,11 +186,11 @@ def _accept_item(batch: _Batch, item: LabelItem) -> LabelReceipt:
     stored = batch.labels.get(segment)
     if stored is not None:
         if stored.content_sha256 != digest:
-            raise LabelConflict(item.trajectory, item.start, _shown(stored), _shown(item))
+            raise LabelConflict(item.trajectory, item.start, stored.shown, item.action_sets or item.actions)
         return _receipt(item, member, "duplicate")
     _check_lease(batch, item)
-    batch.labels[segment] = _row(batch, member, item, digest)
-    batch.created.append(batch.labels[segment])
+    batch.labels[segment] = StoredLabel(digest, item.action_sets or item.actions)
+    batch.created.append(_row(batch, member, item, digest))
     return _receipt(item, member, "created")
 
 
@@ -225,7 +231,7 @@ def _items(project: ProjectRow, upload: LabeledUpload) -> list[LabelItem]:
     ]
 
 
-def _check_segment(project: ProjectRow, spaces: Spaces, member: MembershipRow | None, item: LabelItem) -> None:
+def _check_segment(project: ProjectRow, spaces: Spaces, member: Membership | None, item: LabelItem) -> None:
     if member is None:
         raise UnknownResource(f"trajectory in project {project.id}", item.trajectory)
     name, length = f"segment {item.trajectory}:{item.start}", project.segment_length
@@ -259,42 +265,44 @@ def _check_lease(batch: _Batch, item: LabelItem) -> None:
     batch.unreserved += not (holds and lives) and batch.members[item.trajectory].split == "pool"
 
 
-def _row(batch: _Batch, member: MembershipRow, item: LabelItem, digest: str) -> LabelRow:
-    """The next label of the project; its watermark is taken under the project's lock."""
-    project = batch.project
-    project.label_watermark += 1
-    project.pool_labels += member.split == "pool"
-    project.held_out_labels += member.split == "held_out"
-    return LabelRow(
-        id=uuid4(),
-        project_id=project.id,
-        trajectory_id=item.trajectory,
-        start=item.start,
-        split=member.split,
-        actions=list(item.actions),
-        action_sets=None if item.action_sets is None else list(item.action_sets),
-        content_sha256=digest,
-        residual=item.residual,
-        source=batch.source.model_dump(mode="json"),
-        acquisition_id=batch.acquisition.id if batch.acquisition else None,
-        watermark=project.label_watermark,
-        created_at=batch.now,
-    )
+def _row(batch: _Batch, member: Membership, item: LabelItem, digest: str) -> dict[str, object]:
+    """The next label of the project, by column; its watermark is taken under the project's lock."""
+    batch.watermark += 1
+    return {
+        "id": uuid4(),
+        "project_id": batch.project.id,
+        "trajectory_id": item.trajectory,
+        "start": item.start,
+        "split": member.split,
+        "actions": list(item.actions),
+        "action_sets": None if item.action_sets is None else list(item.action_sets),
+        "content_sha256": digest,
+        "residual": item.residual,
+        "source": batch.source,
+        "acquisition_id": batch.acquisition.id if batch.acquisition else None,
+        "watermark": batch.watermark,
+        "created_at": batch.now,
+    }
 
 
 def _store(session: Session, batch: _Batch) -> None:
     """The new labels, and what follows: their segments are claimed by nobody and stand in no queue."""
     if not batch.created:
         return
-    project, segments = batch.project, [(row.trajectory_id, row.start) for row in batch.created]
+    project, pool_labels = batch.project, sum(row["split"] == "pool" for row in batch.created)
+    segments = [(str(row["trajectory_id"]), int(str(row["start"]))) for row in batch.created]
+    project.label_watermark = batch.watermark
+    project.pool_labels += pool_labels
+    project.held_out_labels += len(batch.created) - pool_labels
+    session.flush()
     queries.insert(session, batch.created)
     claim_queries.drop_claims(session, project.id, [segment for segment in segments if segment in batch.claims])
     claim_queries.drop_from_queues(session, project.id, segments)
     data: dict[str, object] = {
         "count": len(batch.created),
-        "first": batch.created[0].watermark,
+        "first": batch.created[0]["watermark"],
         "watermark": project.label_watermark,
-        "by": batch.source.name,
+        "by": batch.source["name"],
         "acquisition": str(batch.acquisition.id) if batch.acquisition else None,
     }
     events.record(session, project.id, "labels.accepted", data, batch.now)
@@ -313,10 +321,5 @@ def _content_sha256(item: LabelItem) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
-def _shown(label: LabelRow | LabelItem) -> object:
-    return label.action_sets or label.actions
-
-
-def _receipt(item: LabelItem, member: MembershipRow, status: str) -> LabelReceipt:
-    fields = {"trajectory": item.trajectory, "start": item.start, "status": status, "split": member.split}
-    return LabelReceipt.model_validate(fields)
+def _receipt(item: LabelItem, member: Membership, status: Literal["created", "duplicate"]) -> LabelReceipt:
+    return LabelReceipt(trajectory=item.trajectory, start=item.start, status=status, split=member.split)

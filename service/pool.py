@@ -61,8 +61,9 @@ def check(spaces: Spaces, arrays: Mapping[str, NDArray[Any]], source: str) -> No
 def keep(session: Session, stored: Sequence[StoredTrajectory], now: datetime) -> None:
     """Write the contents' rows, before any project is locked and in one order for all: two projects that are given the
     same trajectories at the same time wait for each other once, and never both at once."""
-    for each in sorted(stored, key=lambda one: one.id):
-        queries.keep_content(session, _trajectory_row(each, now))
+    known = queries.contents(session, [each.id for each in stored])
+    fresh = {each.id: _trajectory_row(each, now) for each in stored if each.id not in known}
+    queries.keep_contents(session, [fresh[name] for name in sorted(fresh)])
 
 
 def add(
@@ -73,32 +74,36 @@ def add(
     now: datetime,
     provenance_sha256: str | None = None,
 ) -> TrajectoryReceipt:
-    """Make a stored trajectory a member of the project; the same content twice is one. Raises SplitConflict."""
-    member = queries.membership(session, project.id, stored.id)
-    if member is not None:
+    """Make one trajectory a member; see `add_all`."""
+    return add_all(session, project, [(stored, provenance_sha256)], split, now)[0]
+
+
+def add_all(
+    session: Session,
+    project: ProjectRow,
+    stored: Sequence[tuple[StoredTrajectory, str | None]],
+    split: SplitChoice,
+    now: datetime,
+) -> list[TrajectoryReceipt]:
+    """Make trajectories, each with its provenance if any, members of the locked project; their contents are kept.
+
+    The same content twice is one. Raises SplitConflict.
+    """
+    known = queries.membership_rows(session, project.id, [each.id for each, _ in stored])
+    receipts = []
+    for each, provenance_sha256 in stored:
+        member = known.get(each.id)
+        if member is None:
+            known[each.id] = member = _join(session, project, each, split, now)
+            status = "created"
+        else:
+            status = "duplicate"
         if split not in ("auto", member.split):
-            raise SplitConflict(stored.id, member.split, split)
+            raise SplitConflict(each.id, member.split, split)
         member.provenance_sha256 = member.provenance_sha256 or provenance_sha256
-        return _receipt(stored, member, "duplicate")
-    queries.keep_content(session, _trajectory_row(stored, now))
-    member = MembershipRow(
-        project_id=project.id,
-        trajectory_id=stored.id,
-        split=content_split(stored.id, project.held_out_fraction) if split == "auto" else split,
-        segments=segment_count(stored.transitions, project.segment_length, project.stride),
-        provenance_sha256=provenance_sha256,
-        created_at=now,
-    )
-    session.add(member)
+        receipts.append(_receipt(each, member, status))
     session.flush()
-    if member.split == "pool":
-        project.pool_trajectories += 1
-        project.pool_segments += member.segments
-    else:
-        project.held_out_trajectories += 1
-        project.held_out_segments += member.segments
-    events.record(session, project.id, "trajectory.added", {"trajectory": stored.id, "split": member.split}, now)
-    return _receipt(stored, member, "created")
+    return receipts
 
 
 def content_split(trajectory_id: str, held_out_fraction: float) -> str:
@@ -134,6 +139,28 @@ def describe(member: MembershipRow, content: TrajectoryRow, labeled: int) -> Tra
         has_provenance=member.provenance_sha256 is not None,
         created_at=member.created_at,
     )
+
+
+def _join(
+    session: Session, project: ProjectRow, stored: StoredTrajectory, split: SplitChoice, now: datetime
+) -> MembershipRow:
+    """A new member, counted in its split."""
+    member = MembershipRow(
+        project_id=project.id,
+        trajectory_id=stored.id,
+        split=content_split(stored.id, project.held_out_fraction) if split == "auto" else split,
+        segments=segment_count(stored.transitions, project.segment_length, project.stride),
+        created_at=now,
+    )
+    session.add(member)
+    if member.split == "pool":
+        project.pool_trajectories += 1
+        project.pool_segments += member.segments
+    else:
+        project.held_out_trajectories += 1
+        project.held_out_segments += member.segments
+    events.record(session, project.id, "trajectory.added", {"trajectory": stored.id, "split": member.split}, now)
+    return member
 
 
 def _check_stream(array: NDArray[Any], stream: Stream, name: str) -> None:

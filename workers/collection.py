@@ -177,12 +177,14 @@ def _store(
         stored.append((trajectory, _store_provenance(provenance, project, asked, episode), episode, starts))
     request = LabelsRequest(project=project.id, source=LabelSource(kind="simulator", name=asked.behavior))
     with job.transaction() as session:
-        uploads = []
-        for trajectory, states_sha256, episode, starts in stored:
-            row = projects.find(session, project.id, lock=True)
-            pool.add(session, row, trajectory, asked.split, job.now(), states_sha256)
-            if starts:
-                uploads.append(LabeledUpload(trajectory, episode.actions, None, starts, asked.split))
+        pool.keep(session, [trajectory for trajectory, *_ in stored], job.now())
+        row = projects.find(session, project.id, lock=True)
+        pool.add_all(session, row, [(trajectory, states) for trajectory, states, *_ in stored], asked.split, job.now())
+        uploads = [
+            LabeledUpload(trajectory, episode.actions, None, starts, asked.split)
+            for trajectory, _, episode, starts in stored
+            if starts
+        ]
         if uploads:
             labels.accept(session, request, uploads, job.now(), job.worker.settings.job_max_attempts)
 

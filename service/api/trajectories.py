@@ -38,7 +38,7 @@ def add_trajectories(
     with held.database.write() as session:
         pool.keep(session, stored, now)
         row = projects.find(session, project, lock=True)
-        return TrajectoriesAdded(items=[pool.add(session, row, item, split, now) for item in stored])
+        return TrajectoriesAdded(items=pool.add_all(session, row, [(item, None) for item in stored], split, now))
 
 
 @router.get("/trajectories", dependencies=[reader])

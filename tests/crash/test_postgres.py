@@ -61,7 +61,7 @@ def _check_batches(deployment: Deployment) -> None:
     labels = select(LabelRow.acquisition_id, func.count()).group_by(LabelRow.acquisition_id)
     items = select(AcquisitionItemRow.acquisition_id, func.count()).group_by(AcquisitionItemRow.acquisition_id)
     with deployment.database.read() as session:
-        given = dict(session.execute(items).tuples().all())
-        for acquisition, count in session.execute(labels).tuples():
+        given = dict(iter(session.execute(items)))
+        for acquisition, count in session.execute(labels):
             whole = acquisition is None or count == given[acquisition]
             assert whole, f"acquisition {acquisition}: {count} labels of a batch"

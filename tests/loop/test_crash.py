@@ -17,6 +17,7 @@ from asim.client import Client
 from asim.errors import Unreachable
 from service.store.database import open_database
 from service.store.tables import JobRow
+from tests.figures import Figures
 from tests.loop.conftest import Serve
 from tests.loop.invariants import check_invariants, retries
 from tests.loop.labelers import PersistentLabeler
@@ -151,7 +152,7 @@ def test_runners_end_by_themselves_when_the_service_is_killed(scene: Scene) -> N
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_rounds_survive_kills_at_random_moments(scene: Scene) -> None:
+def test_rounds_survive_kills_at_random_moments(scene: Scene, figures: Figures) -> None:
     seed = int(os.environ.get("ASIM_TEST_SEED") or random.SystemRandom().randrange(10**6))
     moments = random.Random(seed)
     targets = ["runner"] * KILLS_EACH + ["API"] * KILLS_EACH
@@ -166,7 +167,10 @@ def test_rounds_survive_kills_at_random_moments(scene: Scene) -> None:
     scene.await_rest(600, background=True)
     check_invariants(scene.client, scene.serving.folder, scene.labeler.acknowledged)
     labels = len(scene.labeler.acknowledged)
-    tell(f"{labels} labels acknowledged, {scene.labeler.disturbed} requests unanswered, all invariants hold")
+    figures.note(f"ASIM_TEST_SEED={seed} and {len(targets)} kills of runners and of the service")
+    figures.add("labels acknowledged", labels, "labels", target=1)
+    figures.add("requests unanswered", scene.labeler.disturbed, "requests")
+    figures.add("rounds of a service with one runner, undisturbed", undisturbed, "s")
 
 
 def _disturbed_round(scene: Scene, target: str, moment: float) -> tuple[str, int, str, float]:

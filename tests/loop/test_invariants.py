@@ -7,7 +7,16 @@ from shutil import copytree
 import pytest
 from sqlalchemy import delete, select, update
 
-from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, JobRow, LabelRow, QueueRow
+from service.store.tables import (
+    AcquisitionItemRow,
+    AcquisitionRow,
+    ClaimRow,
+    EventRow,
+    JobRow,
+    LabelRow,
+    ProjectRow,
+    QueueRow,
+)
 from tests.loop.invariants import check_invariants
 from tests.loop.rows import Segment
 from tests.workers.conftest import open_loop
@@ -57,6 +66,36 @@ def tear_a_blob(loop: Loop) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
+def miscount_the_pool(loop: Loop) -> None:
+    with loop.worker.database.write() as session:
+        session.execute(update(ProjectRow).values(pool_segments=ProjectRow.pool_segments + 1))
+
+
+def skip_a_watermark(loop: Loop) -> None:
+    with loop.worker.database.write() as session:
+        newest = session.scalars(select(LabelRow).order_by(LabelRow.watermark.desc())).first()
+        assert newest is not None
+        newest.watermark += 1
+
+
+def overspend(loop: Loop) -> None:
+    spent = loop.project.budget.spent
+    loop.change(label_budget=spent + 4)  # five more are reserved
+
+
+def do_a_job_twice(loop: Loop) -> None:
+    with loop.worker.database.write() as session:
+        done = session.scalars(select(EventRow).where(EventRow.kind == "job.done")).first()
+        assert done is not None
+        session.add(EventRow(project_id=done.project_id, kind=done.kind, data=done.data, created_at=done.created_at))
+
+
+def queue_a_segment_twice(loop: Loop) -> None:
+    with loop.worker.database.write() as session:
+        first, second = session.scalars(select(QueueRow).order_by(QueueRow.rank).limit(2))
+        second.trajectory_id, second.start = first.trajectory_id, first.start
+
+
 def nothing_of_importance(loop: Loop) -> None:
     with loop.worker.database.write() as session:
         session.execute(delete(QueueRow))
@@ -67,7 +106,35 @@ def test_a_folder_at_rest_passes(rested: Loop) -> None:
     check_invariants(rested.client, rested.folder, acknowledged(rested))
 
 
-@pytest.mark.parametrize("damage", [lose_a_label, free_a_leased_segment, give_a_segment_twice, fail_a_job, tear_a_blob])
+def test_a_label_that_nobody_was_told_of_is_seen_where_all_were_told(rested: Loop) -> None:
+    told = acknowledged(rested)
+    check_invariants(rested.client, rested.folder, {rested.project.id: told}, exact=True)
+    with pytest.raises(AssertionError, match="never acknowledged"):
+        check_invariants(rested.client, rested.folder, told[:-1], exact=True)
+
+
+def test_a_job_may_have_failed_where_that_was_to_be_expected(rested: Loop) -> None:
+    told = acknowledged(rested)
+    fail_a_job(rested)
+    every = [job.id for job in rested.client.jobs(rested.project.id)]
+    check_invariants(rested.client, rested.folder, told, ended=every)
+
+
+DAMAGE = (
+    lose_a_label,
+    free_a_leased_segment,
+    give_a_segment_twice,
+    fail_a_job,
+    tear_a_blob,
+    miscount_the_pool,
+    skip_a_watermark,
+    overspend,
+    do_a_job_twice,
+    queue_a_segment_twice,
+)
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
 def test_damage_is_seen(rested: Loop, damage: Callable[[Loop], None]) -> None:
     told = acknowledged(rested)
     damage(rested)

@@ -47,6 +47,7 @@ def walk(served: Served, listing: str, limit: int, **query: Any) -> list[Json]:
 
 def test_pages_add_up_to_the_whole_listing(on_both: Served) -> None:
     project = busy(on_both)
+    on_both.events(project)  # waits until all are listed
     for listing in LISTINGS:
         whole = walk(on_both, listing, 1000, project=project)
         assert len(whole) >= 7, listing

@@ -1,16 +1,40 @@
-"""Migrations: what they build is what the tables say, on both databases, and they can be taken back."""
+"""Migrations: what they build is what the tables say, on both databases; data outlives them, up, down and cut short."""
 
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from uuid import UUID
 
 import pytest
 from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
-from sqlalchemy import create_engine, inspect, pool
+from sqlalchemy import Engine, create_engine, inspect, pool, select, text
+from sqlalchemy.exc import DBAPIError
 
-from service.store.database import migrate
+from service.settings import Settings
+from service.store.database import migrate, open_database
 from service.store.tables import Row
+from tests.service.first_schema import EMPTY, FIRST, NAMES, SECOND, fill, narrowed, read, write
+from tests.service.kit import Served, serve
+
+COUNTERS = {
+    FIRST: {"pool_trajectories": 2, "pool_segments": 12, "held_out_trajectories": 1, "held_out_segments": 4},
+    SECOND: {"pool_trajectories": 1, "pool_segments": 9, "held_out_trajectories": 2, "held_out_segments": 5},
+    EMPTY: {"pool_trajectories": 0, "pool_segments": 0, "held_out_trajectories": 0, "held_out_segments": 0},
+}
+HELD_OUT_LABELS = {FIRST: 1, SECOND: 2, EMPTY: 0}
+MIGRATE = "import sys; from service.store.database import migrate; migrate(sys.argv[1])"
+KILLED = f"""
+import os, signal
+from alembic import op
+op.batch_alter_table = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)  # columns are there, not all are filled
+{MIGRATE}
+"""
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -20,15 +44,65 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return str(request.getfixturevalue("postgres_url"))
 
 
+def _engine(url: str) -> Engine:
+    return create_engine(url, poolclass=pool.NullPool)
+
+
 def _differences(url: str) -> list[object]:
-    engine = create_engine(url, poolclass=pool.NullPool)
-    with engine.connect() as connection:
+    with _engine(url).connect() as connection:
         options = {"compare_type": True, "compare_server_default": True}
         return list(compare_metadata(MigrationContext.configure(connection, opts=options), Row.metadata))
 
 
 def _tables(url: str) -> set[str]:
-    return set(inspect(create_engine(url, poolclass=pool.NullPool)).get_table_names())
+    return set(inspect(_engine(url)).get_table_names())
+
+
+def _version(url: str) -> str | None:
+    with _engine(url).connect() as connection:
+        return MigrationContext.configure(connection).get_current_revision()
+
+
+def _schema(url: str) -> dict[str, Any]:
+    """Columns, keys and indexes of all tables, to be compared."""
+    looked = inspect(_engine(url))
+
+    def told(table: str) -> list[Any]:
+        columns = [f"{each['name']} {each['type']} {each['nullable']}" for each in looked.get_columns(table)]
+        indexes = [f"{each['name']} {each['column_names']} {each['unique']}" for each in looked.get_indexes(table)]
+        keys = [f"{each['constrained_columns']} {each['referred_table']}" for each in looked.get_foreign_keys(table)]
+        return [sorted(columns), sorted(indexes), sorted(keys), list(looked.get_pk_constraint(table).values())[:1]]
+
+    return {table: told(table) for table in sorted(looked.get_table_names())}
+
+
+def _downgrade(url: str, revision: str) -> None:
+    config = Config()
+    config.set_main_option("script_location", "service.store:migrations")
+    config.set_main_option("path_separator", "os")
+    config.attributes["url"] = url
+    command.downgrade(config, revision)
+
+
+def _process(code: str, url: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", code, url], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def _ended(process: subprocess.Popen[bytes]) -> int:
+    try:
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode in (0, -9), errors.decode()
+    return process.returncode
+
+
+def _check_references(url: str) -> None:
+    """SQLite does not look while tables are made anew."""
+    if url.startswith("sqlite"):
+        with _engine(url).connect() as connection:
+            assert connection.exec_driver_sql("PRAGMA foreign_key_check").all() == []
+            assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"
 
 
 def test_up_down_and_up_again_is_what_the_tables_say(url: str) -> None:
@@ -36,11 +110,173 @@ def test_up_down_and_up_again_is_what_the_tables_say(url: str) -> None:
     assert _differences(url) == []
     assert _tables(url) == {*Row.metadata.tables, "alembic_version"}
     migrate(url)  # the newest already
-    config = Config()
-    config.set_main_option("script_location", "service.store:migrations")
-    config.set_main_option("path_separator", "os")
-    config.attributes["url"] = url
-    command.downgrade(config, "base")
+    _downgrade(url, "base")
     assert _tables(url) == {"alembic_version"}
     migrate(url)
     assert _differences(url) == []
+
+
+def test_the_first_schema_is_upgraded_with_its_data_and_counted(url: str) -> None:
+    migrate(url, "0001")
+    before = fill(url)
+    migrate(url)
+    assert _differences(url) == []
+    after = read(url)
+    assert narrowed(after, before) == before
+    for row in after["project"]:
+        counted = {name: row[name] for name in next(iter(COUNTERS.values()))}
+        assert counted == COUNTERS[UUID(hex=row["id"])]
+        assert row["held_out_labels"] == HELD_OUT_LABELS[UUID(hex=row["id"])]
+    assert {row["mode"] for row in after["acquisition"]} == {"pool"}
+    assert {(row["actor"], row["correlation"], row["transaction"]) for row in after["event"]} == {("", "", 0)}
+    assert {(row["correlation"], row["checkpoint_stage"]) for row in after["job"]} == {("", None)}
+    assert after["idempotency"] == []
+    _check_references(url)
+
+
+def test_the_tables_read_every_row_of_an_upgraded_database(url: str) -> None:
+    migrate(url, "0001")
+    before = fill(url)
+    migrate(url)
+    database = open_database(url)
+    with database.read() as session:
+        for mapper in Row.registry.mappers:
+            found = session.scalars(select(mapper.class_)).all()
+            assert len(found) == len(before.get(mapper.class_.__tablename__, [])), mapper
+    database.close()
+
+
+def test_an_upgraded_service_goes_on_where_it_was(url: str, tmp_path: Path) -> None:
+    migrate(url, "0001")
+    fill(url)
+    migrate(url)
+    served = serve(Settings(data_folder=tmp_path, database_url=url))
+    try:
+        _check_service(served)
+    finally:
+        served.close()
+
+
+def _check_service(served: Served) -> None:
+    first, second = served.show(str(FIRST)), served.show(str(SECOND))
+    assert first["counts"] == {
+        "pool_trajectories": 2,
+        "pool_segments": 12,
+        "unlabeled": 9,
+        "leased": 1,
+        "labeled": 2,
+        "held_out_trajectories": 1,
+        "held_out_segments": 4,
+        "held_out_labeled": 1,
+    }
+    assert first["budget"] == {"total": 10, "spent": 2, "reserved": 1, "remaining": 7}
+    assert (second["counts"]["held_out_labeled"], second["label_watermark"]) == (2, 3)
+    assert [row["actor"] for row in served.events(str(FIRST))] == ["", ""]
+    held_out = {"trajectory": NAMES[2], "start": 0, "actions": [0]}
+    assert served.label(str(FIRST), [held_out]).json()["watermark"] == 4
+    assert served.show(str(FIRST))["counts"]["held_out_labeled"] == 2
+    taken = {"trajectory": NAMES[1], "start": 1, "actions": [0]}
+    assert served.label(str(FIRST), [taken]).status_code == 423
+    lease = {"id": str(UUID(int=FIRST.int + 1)), "token": 1}
+    assert served.label(str(FIRST), [taken], lease).json()["created"] == 1
+    assert served.get(f"/acquisitions/{lease['id']}")["status"] == "labeled"
+
+
+def test_going_back_keeps_all_that_the_first_schema_knows(url: str) -> None:
+    migrate(url, "0001")
+    before, schema = fill(url), _schema(url)
+    migrate(url)
+    _downgrade(url, "0001")
+    assert (_version(url), _schema(url), read(url)) == ("0001", schema, before)
+    _check_references(url)
+    migrate(url)
+    assert narrowed(read(url), before) == before
+
+
+def test_going_back_says_what_is_new_in_the_first_schemas_words(url: str) -> None:
+    migrate(url, "0001")
+    before = fill(url)
+    migrate(url)
+    job, rounded, leased, labeled = (UUID(int=FIRST.int + more) for more in (6, 3, 1, 2))
+    quoted = [str(each) if "postgresql" in url else each.hex for each in (job, rounded, leased, labeled)]
+    write(
+        url,
+        f"UPDATE job SET state = 'cancelled' WHERE id = '{quoted[0]}'",  # noqa: S608
+        f"UPDATE round SET status = 'cancelled' WHERE id = '{quoted[1]}'",  # noqa: S608
+        f"UPDATE acquisition SET status = 'expired' WHERE id = '{quoted[2]}'",  # noqa: S608
+        f"UPDATE acquisition SET mode = 'explore' WHERE id = '{quoted[3]}'",  # noqa: S608
+        f"UPDATE acquisition_item SET actions = '[1]' WHERE acquisition_id = '{quoted[3]}'",  # noqa: S608
+        "UPDATE job SET project_id = NULL, kind = 'canary' WHERE state = 'queued'",
+        "INSERT INTO idempotency (caller, route, key, request_sha256, expires_at) "
+        "VALUES ('local', 'POST /labels', 'k', 'x', '2030-01-01 00:00:00')",
+    )
+    _downgrade(url, "0001")
+    after = read(url)
+    states = {row["id"]: row["state"] for row in after["job"]}
+    assert states.pop(job.hex) == "failed"
+    assert set(states.values()) == {"done"}  # the other one that waited is a canary by now
+    assert {row["id"]: row["status"] for row in after["round"]}[rounded.hex] == "failed"
+    statuses = {row["id"]: row["status"] for row in after["acquisition"]}
+    assert statuses[leased.hex] == "leased"
+    assert labeled.hex not in statuses
+    assert labeled.hex not in {row["acquisition_id"] for row in after["acquisition_item"]}
+    assert after["label"] == before["label"]  # also those that the forgotten acquisition brought
+    _check_references(url)
+    migrate(url)
+    assert _differences(url) == []
+
+
+def test_a_migration_that_fails_in_the_middle_changes_nothing(url: str) -> None:
+    migrate(url, "0001")
+    write(url, "ALTER TABLE job ADD COLUMN checkpoint_stage VARCHAR(60)")  # the last column that the migration adds
+    before, schema = fill(url), _schema(url)
+    with pytest.raises(DBAPIError, match="checkpoint_stage"):
+        migrate(url)
+    assert (_version(url), _schema(url), read(url)) == ("0001", schema, before)
+    write(url, "ALTER TABLE job DROP COLUMN checkpoint_stage")
+    migrate(url)
+    assert _differences(url) == []
+
+
+def test_a_migration_that_is_killed_in_the_middle_changes_nothing(url: str) -> None:
+    migrate(url, "0001")
+    before, schema = fill(url), _schema(url)
+    assert _ended(_process(KILLED, url)) == -9
+    assert (_version(url), _schema(url), read(url)) == ("0001", schema, before)
+    migrate(url)
+    assert _differences(url) == []
+    assert narrowed(read(url), before) == before
+
+
+def test_processes_that_migrate_at_once_take_turns(postgres_url: str) -> None:
+    migrate(postgres_url, "0001")
+    before = fill(postgres_url)
+    engine = _engine(postgres_url)
+    with engine.begin() as connection:
+        connection.execute(text("LOCK TABLE job IN ACCESS SHARE MODE"))  # holds the first one in the middle
+        processes = [_process(MIGRATE, postgres_url) for _ in range(2)]
+        _until(lambda: _waiting(engine) == 2)
+        assert {process.poll() for process in processes} == {None}
+    assert [_ended(process) for process in processes] == [0, 0]
+    assert _differences(postgres_url) == []
+    assert narrowed(read(postgres_url), before) == before
+
+
+def test_processes_that_make_an_empty_database_at_once_take_turns(url: str) -> None:
+    processes = [_process(MIGRATE, url) for _ in range(2)]
+    assert [_ended(process) for process in processes] == [0, 0]
+    assert _differences(url) == []
+
+
+def _waiting(engine: Engine) -> int:
+    """Sessions of this database that wait for a lock."""
+    query = "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() AND wait_event_type = 'Lock'"
+    with engine.connect() as connection:
+        return connection.scalar(text(query)) or 0
+
+
+def _until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 30
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)

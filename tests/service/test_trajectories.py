@@ -69,6 +69,7 @@ def test_two_projects_may_store_the_same_trajectory_at_once(on_both: Served) -> 
         with held.database.write() as session:
             row = session.get_one(ProjectRow, UUID(first))
             stored = pool.store(held.blobs, projects.spaces_of(row), new, "0.npz")
+            pool.keep(session, [stored], on_both.clock())
             pool.add(session, row, stored, "auto", on_both.clock())
             session.flush()
             waiting = thread.submit(on_both.upload, second, new)

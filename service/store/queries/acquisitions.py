@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from datetime import datetime
+from typing import NamedTuple
 from uuid import UUID
 
 from sqlalchemy import and_, delete, func, or_, select, tuple_, update
@@ -33,23 +34,19 @@ def free_queue(
 
     lock: pass over the rows that another acquisition reads at this moment (PostgreSQL; SQLite has one writer anyway).
     """
-    label = and_(
+    label = select(LabelRow.id).where(
         LabelRow.project_id == QueueRow.project_id,
         LabelRow.trajectory_id == QueueRow.trajectory_id,
         LabelRow.start == QueueRow.start,
     )
-    claim = and_(
+    claim = select(ClaimRow.token).where(
         ClaimRow.project_id == QueueRow.project_id,
         ClaimRow.trajectory_id == QueueRow.trajectory_id,
         ClaimRow.start == QueueRow.start,
         live_claim(now),
     )
-    statement = (
-        select(QueueRow)
-        .outerjoin(LabelRow, label)
-        .outerjoin(ClaimRow, claim)
-        .where(QueueRow.scoring_id == scoring.id, LabelRow.id.is_(None), ClaimRow.token.is_(None))
-    )
+    # Not outer joins: without statistics PostgreSQL joins them by the claims' expiry, every claim to every row.
+    statement = select(QueueRow).where(QueueRow.scoring_id == scoring.id, ~label.exists(), ~claim.exists())
     statement = statement.order_by(QueueRow.rank).limit(count)
     return session.scalars(statement.with_for_update(of=QueueRow, skip_locked=True) if lock else statement).all()
 
@@ -67,13 +64,21 @@ def take_claims(session: Session, claims: Sequence[ClaimRow]) -> None:
     session.add_all(claims)
 
 
-def claims_on(session: Session, project_id: UUID, segments: Sequence[Segment]) -> dict[Segment, ClaimRow]:
-    """By segment, whoever holds, or last held, it."""
-    found: dict[Segment, ClaimRow] = {}
+class Claim(NamedTuple):
+    """Whoever holds, or last held, a segment."""
+
+    token: int
+    expires_at: datetime
+
+
+def claims_on(session: Session, project_id: UUID, segments: Sequence[Segment]) -> dict[Segment, Claim]:
+    """Claims by segment, of those that have one."""
+    found: dict[Segment, Claim] = {}
+    columns = (ClaimRow.trajectory_id, ClaimRow.start, ClaimRow.token, ClaimRow.expires_at)
     for some in parts(segments):
         named = among(session, ClaimRow.trajectory_id, ClaimRow.start, some)
-        rows = session.scalars(select(ClaimRow).where(ClaimRow.project_id == project_id, named))
-        found |= {(row.trajectory_id, row.start): row for row in rows}
+        rows = session.execute(select(*columns).where(ClaimRow.project_id == project_id, named))
+        found |= {(trajectory, start): Claim(token, until) for trajectory, start, token, until in rows}
     return found
 
 

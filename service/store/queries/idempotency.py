@@ -16,18 +16,19 @@ def insert_or_find(
 
     The insert waits for another transaction that has just inserted the same key; what that one committed is found.
     """
-    named = (IdempotencyRow.caller == caller, IdempotencyRow.route == route, IdempotencyRow.key == key)
-    session.execute(delete(IdempotencyRow).where(*named, IdempotencyRow.expires_at <= now))
     insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
-    values = {
-        "caller": caller,
-        "route": route,
-        "key": key,
-        "request_sha256": request_sha256,
-        "expires_at": expires_at,
-    }
-    session.execute(insert(IdempotencyRow).values(values).on_conflict_do_nothing())
-    return session.get_one(IdempotencyRow, (caller, route, key))
+    values = {"caller": caller, "route": route, "key": key, "request_sha256": request_sha256, "expires_at": expires_at}
+    fresh = insert(IdempotencyRow).values(values).on_conflict_do_nothing().returning(IdempotencyRow)
+    made = session.scalar(fresh)
+    if made is not None:
+        return made
+    found = session.get(IdempotencyRow, (caller, route, key))
+    if found is not None and found.expires_at > now:
+        return found
+    if found is not None:  # it stands for nothing any more
+        session.delete(found)
+        session.flush()
+    return session.scalars(fresh).one()
 
 
 def forget_expired(session: Session, now: datetime) -> None:

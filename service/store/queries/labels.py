@@ -1,31 +1,54 @@
 """Labels of a project."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple, cast
 from uuid import UUID
 
 import sqlalchemy
-from sqlalchemy import func, select
+from sqlalchemy import JSON, func, select
 from sqlalchemy.orm import Session
 
 from service.store.queries.segments import Segment, among, parts
 from service.store.tables import LabelRow
 
+if TYPE_CHECKING:
+    import psycopg  # an optional dependency
 
-def labels_of(session: Session, project_id: UUID, segments: Sequence[Segment]) -> dict[Segment, LabelRow]:
+
+class StoredLabel(NamedTuple):
+    """As much of a label as tells whether another is the same: its content, and how to show it."""
+
+    content_sha256: str
+    shown: object
+
+
+def labels_of(session: Session, project_id: UUID, segments: Sequence[Segment]) -> dict[Segment, StoredLabel]:
     """Labels by segment, of those that have one."""
-    found: dict[Segment, LabelRow] = {}
+    found: dict[Segment, StoredLabel] = {}
+    columns = (
+        *(LabelRow.trajectory_id, LabelRow.start),
+        *(LabelRow.content_sha256, LabelRow.actions, LabelRow.action_sets),
+    )
     for some in parts(segments):
         named = among(session, LabelRow.trajectory_id, LabelRow.start, some)
-        rows = session.scalars(select(LabelRow).where(LabelRow.project_id == project_id, named))
-        found |= {(row.trajectory_id, row.start): row for row in rows}
+        rows = session.execute(select(*columns).where(LabelRow.project_id == project_id, named))
+        found |= {(row[0], row[1]): StoredLabel(row[2], row[4] or row[3]) for row in rows}
     return found
 
 
-def insert(session: Session, rows: Sequence[LabelRow]) -> None:
-    """Write new labels; a third of the time that the unit of work takes for as many objects."""
+def insert(session: Session, rows: Sequence[Mapping[str, object]]) -> None:
+    """Write new labels, by column; on PostgreSQL by COPY, a quarter of the time of an INSERT of as many rows."""
+    connection = session.connection()
+    if connection.dialect.driver != "psycopg":
+        session.execute(sqlalchemy.insert(LabelRow), [dict(row) for row in rows])
+        return
     columns = [column.key for column in LabelRow.__table__.columns]
-    values = [{column: getattr(row, column) for column in columns} for row in rows]
-    session.execute(sqlalchemy.insert(LabelRow), values)
+    jsons = {column.key for column in LabelRow.__table__.columns if isinstance(column.type, JSON)}
+    driver = cast("psycopg.Connection", connection.connection.driver_connection)
+    with driver.cursor() as cursor, cursor.copy(f"COPY label ({', '.join(columns)}) FROM STDIN") as copy:
+        for row in rows:
+            copy.write_row([_json(row[name]) if name in jsons else row[name] for name in columns])
 
 
 def labels_up_to(session: Session, project_id: UUID, split: str, watermark: int) -> Sequence[LabelRow]:
@@ -52,3 +75,7 @@ def labeled_by_trajectory(session: Session, project_id: UUID, trajectories: Sequ
         .group_by(LabelRow.trajectory_id)
     )
     return {row[0]: row[1] for row in session.execute(statement)}
+
+
+def _json(value: object) -> str | None:
+    return None if value is None else json.dumps(value)

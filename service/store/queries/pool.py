@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from typing import NamedTuple
 from uuid import UUID
 
 from sqlalchemy import ColumnElement, and_, func, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
+from api_schemas.base import Split
 from service.store.tables import ClaimRow, LabelRow, MembershipRow, ProjectRow, TrajectoryRow
 
 
@@ -62,13 +64,21 @@ def members(session: Session, project_id: UUID, split: str, *, with_provenance: 
     return [Member(name, segments) for name, segments in session.execute(statement.order_by(MembershipRow.id))]
 
 
-def memberships_of(session: Session, project_id: UUID, trajectory_ids: Sequence[str]) -> dict[str, MembershipRow]:
+class Membership(NamedTuple):
+    """As much of a membership as the rules of labels need."""
+
+    split: Split
+    segments: int
+
+
+def memberships_of(session: Session, project_id: UUID, trajectory_ids: Sequence[str]) -> dict[str, Membership]:
     """Memberships in the project by trajectory, of those that are members."""
-    found: dict[str, MembershipRow] = {}
+    found: dict[str, Membership] = {}
+    columns = (MembershipRow.trajectory_id, MembershipRow.split, MembershipRow.segments)
     for i in range(0, len(trajectory_ids), 500):
         named = MembershipRow.trajectory_id.in_(trajectory_ids[i : i + 500])
-        rows = session.scalars(select(MembershipRow).where(MembershipRow.project_id == project_id, named))
-        found |= {row.trajectory_id: row for row in rows}
+        rows = session.execute(select(*columns).where(MembershipRow.project_id == project_id, named))
+        found |= {name: Membership("pool" if split == "pool" else "held_out", count) for name, split, count in rows}
     return found
 
 
@@ -80,13 +90,24 @@ def newest_membership(session: Session, project_id: UUID, split: str) -> int:
     return session.scalar(statement) or 0
 
 
-def keep_content(session: Session, row: TrajectoryRow) -> None:
-    """Write the trajectory's row unless it is there; another project may be writing the same one at this moment."""
-    if session.get(TrajectoryRow, row.id) is not None:
+def membership_rows(session: Session, project_id: UUID, trajectory_ids: Sequence[str]) -> dict[str, MembershipRow]:
+    """Membership rows by trajectory, of those that are members."""
+    found: dict[str, MembershipRow] = {}
+    for i in range(0, len(trajectory_ids), 500):
+        named = MembershipRow.trajectory_id.in_(trajectory_ids[i : i + 500])
+        rows = session.scalars(select(MembershipRow).where(MembershipRow.project_id == project_id, named))
+        found |= {row.trajectory_id: row for row in rows}
+    return found
+
+
+def keep_contents(session: Session, rows: Sequence[TrajectoryRow]) -> None:
+    """Write rows of trajectories that may be there; another project may be writing the same ones at this moment."""
+    if not rows:
         return
     insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
-    values = {column.key: getattr(row, column.key) for column in TrajectoryRow.__table__.columns}
-    session.execute(insert(TrajectoryRow).values(values).on_conflict_do_nothing())
+    columns = [column.key for column in TrajectoryRow.__table__.columns]
+    values = [{column: getattr(row, column) for column in columns} for row in rows]
+    session.execute(insert(TrajectoryRow).on_conflict_do_nothing(), values)
 
 
 def projects_in_order(session: Session) -> Sequence[ProjectRow]:
