@@ -11,7 +11,7 @@ from api_schemas.acquisitions import AcquireRequest, Acquisition, AcquisitionIte
 from api_schemas.strategies import STRATEGY_NAMES
 from service import draws, events, leases, projects, scorings
 from service.draws import Candidate
-from service.errors import BudgetExhausted, PoolExhausted, UnknownStrategy
+from service.errors import BudgetExhausted, NothingToExplore, PoolExhausted, UnknownStrategy
 from service.store.queries import acquisitions as queries
 from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, JobRow, ProjectRow, QueueRow
 
@@ -145,7 +145,7 @@ def _draw_explorations(session: Session, project: ProjectRow, room: Room) -> Dra
     """States of the pool and actions to execute there, both drawn uniformly: no model proposes any yet."""
     candidates = draws.explorations(session, project, room.count)
     if not candidates:
-        raise PoolExhausted(room.count, 0, "pool")
+        raise NothingToExplore(project.id, projects.environment_of(project).simulator)
     return Draw("random", candidates, reason=room.reason)
 
 

@@ -23,7 +23,7 @@ def cancel(session: Session, job_id: UUID, now: datetime) -> JobRow:
 
 
 def _cancel_scoring(session: Session, scoring_id: UUID, now: datetime) -> None:
-    scorings.fail(session, scoring_id)
+    scorings.fail(session, scoring_id, now)
     round_id = scorings.find(session, scoring_id).round_id
     if round_id is not None and rounds.find(session, round_id, lock=True).status == "scoring":
         rounds.cancel(session, round_id, now)

@@ -121,6 +121,16 @@ class PoolExhausted(ServiceError):
         )
 
 
+class NothingToExplore(ServiceError):
+    """The pool holds no state to explore from."""
+
+    status_code = 409
+
+    def __init__(self, project: UUID, simulator: str | None) -> None:
+        missing = "trajectory" if simulator is None else f"trajectory whose states in {simulator} are kept"
+        super().__init__(f"mode: project {project} has no {missing} in its pool that an exploration could start from")
+
+
 class BudgetExhausted(ServiceError):
     """The project's label budget does not cover this."""
 

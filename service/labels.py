@@ -63,7 +63,7 @@ class LabeledUpload:
 class _Batch:
     """One request while it is accepted: what is there of its segments, and what comes of it.
 
-    explored: segments that explore items brought; their labels were reserved by the acquisition, not by a claim.
+    uploaded: segments of whole trajectories, which need no lease.
     """
 
     project: ProjectRow
@@ -74,7 +74,7 @@ class _Batch:
     members: dict[str, Membership]
     labels: dict[Segment, StoredLabel]
     claims: dict[Segment, Claim]
-    explored: frozenset[Segment]
+    uploaded: frozenset[Segment]
     receipts: list[LabelReceipt] = field(default_factory=list)
     created: list[dict[str, object]] = field(default_factory=list)
     unreserved: int = 0
@@ -92,10 +92,8 @@ def accept(
     project = projects.find(session, request.project, lock=True)
     acquisition = _acquisition(session, project, request)
     uploaded, reserved = _take_uploads(session, project, acquisition, uploads, now)
-    items = [item for item, _ in uploaded] + list(request.items)
-    explored = frozenset((item.trajectory, item.start) for item, explores in uploaded if explores)
-    batch = _batch(session, project, request.source, acquisition, items, explored, now)
-    for item in items:
+    batch = _batch(session, project, request.source, acquisition, uploaded, request.items, now)
+    for item in (*uploaded, *request.items):
         batch.receipts.append(_accept_item(batch, item))
     _store(session, batch)
     if acquisition is not None:
@@ -137,18 +135,21 @@ def _take_uploads(
     acquisition: AcquisitionRow | None,
     uploads: Sequence[LabeledUpload],
     now: datetime,
-) -> tuple[list[tuple[LabelItem, bool]], int]:
-    """The labels of uploaded trajectories, which become members first, and whether they answer an exploration; and how
-    many labels live leases had reserved for such answers."""
-    taken, reserved = [], 0
+) -> tuple[list[LabelItem], int]:
+    """The labels of uploaded trajectories, which become members first; and how many live leases had reserved them."""
+    taken: list[LabelItem] = []
+    reserved = 0
     for position, upload in enumerate(uploads):
-        explores = upload.rank is not None
-        split: SplitChoice = "pool" if explores else upload.split
+        split: SplitChoice = upload.split if upload.rank is None else "pool"
         pool.add(session, project, upload.stored, split, now, upload.provenance_sha256)
+        items = _items(project, upload)
         if upload.rank is not None:
+            if not items:
+                reason = f"must be at least 1: an exploration brings a segment of {project.segment_length} transitions"
+                raise InvalidLabel(f"{upload.stored.source}.starts: length", 0, reason)
             name = upload.stored.id
             reserved += explorations.answer(session, project, acquisition, upload.rank, name, position, now)
-        taken += [(item, explores) for item in _items(project, upload)]
+        taken += items
     return taken, reserved
 
 
@@ -157,11 +158,12 @@ def _batch(
     project: ProjectRow,
     source: LabelSource,
     acquisition: AcquisitionRow | None,
-    items: Sequence[LabelItem],
-    explored: frozenset[Segment],
+    uploaded: Sequence[LabelItem],
+    asked: Sequence[LabelItem],
     now: datetime,
 ) -> _Batch:
     """A few statements for any number of items, which all fit their segments."""
+    items = (*uploaded, *asked)
     members = pool_queries.memberships_of(session, project.id, sorted({item.trajectory for item in items}))
     spaces = projects.spaces_of(project)
     for item in items:
@@ -176,7 +178,7 @@ def _batch(
         members=members,
         labels=queries.labels_of(session, project.id, segments),
         claims=claim_queries.claims_on(session, project.id, segments),
-        explored=explored,
+        uploaded=frozenset((item.trajectory, item.start) for item in uploaded),
     )
 
 
@@ -258,7 +260,7 @@ def _check_lease(batch: _Batch, item: LabelItem) -> None:
     claim, acquisition = batch.claims.get(segment), batch.acquisition
     holds = claim is not None and acquisition is not None and claim.token == acquisition.token
     lives = claim is not None and claim.expires_at > batch.now
-    if acquisition is not None and not holds and segment not in batch.explored:
+    if acquisition is not None and not holds and segment not in batch.uploaded:
         raise LeaseLost(acquisition.id, f"it does not hold segment {item.trajectory}:{item.start}")
     if claim is not None and lives and not holds:
         raise SegmentLeased(item.trajectory, item.start, claim.expires_at)

@@ -29,7 +29,7 @@ def give_up(session: Session, row: JobRow, now: datetime) -> None:
     if row.kind == "train_round":
         rounds.fail(session, row.subject_id, error, now)
     elif row.kind in ("score_shard", "merge_scores"):
-        scorings.fail(session, row.subject_id)
+        scorings.fail(session, row.subject_id, now)
         round_id = scorings.find(session, row.subject_id).round_id
         if round_id is not None:
             rounds.fail(session, round_id, error, now)

@@ -64,10 +64,9 @@ def find(session: Session, round_id: UUID, *, lock: bool = False) -> RoundRow:
     return row
 
 
-def begin_training(session: Session, round_id: UUID) -> None:
+def begin_training(session: Session, round_id: UUID, now: datetime) -> None:
     """The round's job has started; a round that is in use already stays so."""
-    row = find(session, round_id, lock=True)
-    row.status = "training" if row.status == "queued" else row.status
+    _advance(session, round_id, "queued", "training", now)
 
 
 def stage_done(session: Session, round_id: UUID, name: str, seconds: float) -> None:
@@ -84,10 +83,9 @@ def record_error(session: Session, round_id: UUID, error: ModelError, now: datet
     events.record(session, row.project_id, "round.evaluated", data, now)
 
 
-def begin_scoring(session: Session, round_id: UUID) -> None:
+def begin_scoring(session: Session, round_id: UUID, now: datetime) -> None:
     """Training and evaluation are done."""
-    row = find(session, round_id, lock=True)
-    row.status = "scoring" if row.status == "training" else row.status
+    _advance(session, round_id, "training", "scoring", now)
 
 
 def make_current(session: Session, round_id: UUID, now: datetime) -> None:
@@ -162,6 +160,13 @@ def describe(session: Session, row: RoundRow) -> Round:
         created_at=row.created_at,
         finished_at=row.finished_at,
     )
+
+
+def _advance(session: Session, round_id: UUID, before: str, after: str, now: datetime) -> None:
+    row = find(session, round_id, lock=True)
+    if row.status == before:
+        row.status = after
+        events.record(session, row.project_id, f"round.{after}", {"round": str(row.id), "number": row.number}, now)
 
 
 def _supersede_queued(session: Session, row: RoundRow, now: datetime) -> None:

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from api_schemas.jobs import MergeScores, ScoreShard, SelectQueue, TrainRound
 from api_schemas.strategies import CATALOG, COLD_START_STRATEGY
-from service import jobs
+from service import events, jobs
 from service.errors import UnknownResource
 from service.settings import Settings
 from service.store.queries import acquisitions as queries
@@ -89,6 +89,7 @@ def start(
     )
     session.add(scoring)
     session.flush()
+    _tell(session, scoring, "started", now, shards=len(cuts))
     for number, (first, last) in enumerate(cuts):
         session.add(ShardRow(scoring_id=scoring.id, number=number, first=first, last=last))
         payload = ScoreShard(scoring=scoring.id, shard=number)
@@ -133,7 +134,7 @@ def shard_scored(
         _merge(session, scoring, now, limits)
 
 
-def publish(session: Session, scoring_id: UUID, ranked: Sequence[Ranked]) -> ScoringRow:
+def publish(session: Session, scoring_id: UUID, ranked: Sequence[Ranked], now: datetime) -> ScoringRow:
     """The queue becomes `ranked`, and the scoring is ready."""
     scoring = find(session, scoring_id, lock=True)
     rows = [
@@ -150,6 +151,7 @@ def publish(session: Session, scoring_id: UUID, ranked: Sequence[Ranked]) -> Sco
     queries.replace_queue(session, scoring, rows)
     scoring.status = "ready"
     scoring.selections += 1
+    _tell(session, scoring, "ready", now, queued=len(ranked))
     return scoring
 
 
@@ -161,9 +163,12 @@ def find(session: Session, scoring_id: UUID, *, lock: bool = False) -> ScoringRo
     return row
 
 
-def fail(session: Session, scoring_id: UUID) -> None:
+def fail(session: Session, scoring_id: UUID, now: datetime) -> None:
     """A scoring whose job gave up is not used; the next acquire starts another."""
-    find(session, scoring_id, lock=True).status = "failed"
+    scoring = find(session, scoring_id, lock=True)
+    if scoring.status != "failed":
+        scoring.status = "failed"
+        _tell(session, scoring, "failed", now)
 
 
 def _ranking(session: Session, project: ProjectRow, requested: str) -> tuple[str, RoundRow | None]:
@@ -184,6 +189,11 @@ def _request(
         return waiting or jobs.enqueue(session, project.id, payload, round_row.id, now, limits.max_attempts)
     scoring = start(session, project, strategy, round_row, now, limits)
     return _waiting(session, scoring, now, limits)
+
+
+def _tell(session: Session, scoring: ScoringRow, what: str, now: datetime, **more: object) -> None:
+    data = {"scoring": str(scoring.id), "strategy": scoring.strategy, **more}
+    events.record(session, scoring.project_id, f"scoring.{what}", data, now)
 
 
 def _outgrown(session: Session, scoring: ScoringRow) -> bool:

@@ -80,7 +80,7 @@ def run_selection(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, o
         for i in candidates[order]
     ]
     with job.transaction() as session:
-        published = scorings.publish(session, scoring.id, ranked)
+        published = scorings.publish(session, scoring.id, ranked, job.now())
         if published.round_id is not None:
             rounds.make_current(session, published.round_id, job.now())
     return {"queued": len(ranked), "pool": len(pool.scores)}

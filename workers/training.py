@@ -51,7 +51,7 @@ def run_round(job: RunningJob, payload: TrainRound) -> dict[str, object]:
     if plan.round.status in ("superseded", "failed", "cancelled"):
         return {"round": str(plan.round.id), "status": plan.round.status}
     with job.transaction() as session:
-        rounds.begin_training(session, plan.round.id)
+        rounds.begin_training(session, plan.round.id, job.now())
     labeled = _labels(job, plan, "pool")
     if labeled is None:
         raise NothingToLearn(plan.project.id)
@@ -159,7 +159,7 @@ def _request_scoring(job: RunningJob, plan: Plan) -> dict[str, object]:
     """A strategy that needs models is scored under this round's; the others have nothing to wait for."""
     limits = scorings.limits_of(job.worker.settings)
     with job.transaction() as session:
-        rounds.begin_scoring(session, plan.round.id)
+        rounds.begin_scoring(session, plan.round.id, job.now())
         if not scorings.NEEDS[plan.strategy]:
             rounds.make_current(session, plan.round.id, job.now())
         elif scoring_queries.newest_scoring(session, plan.project.id, plan.strategy, plan.round.id) is None:

@@ -13,7 +13,7 @@ from service.errors import BodyTooLarge, ServiceError
 from service.log import get_logger
 
 log = get_logger("api")
-HEADERS = {401: {"WWW-Authenticate": "Bearer"}, 503: {"Retry-After": "5"}}  # what a status says beside its body
+HEADERS = {401: {"WWW-Authenticate": "Bearer"}, 503: {"Retry-After": "1"}}  # what a status says beside its body
 
 
 def install(app: FastAPI) -> None:
@@ -79,9 +79,12 @@ def _database_error(request: Request, error: Exception) -> JSONResponse:
 
 
 def _unexpected(request: Request, error: Exception) -> JSONResponse:
-    log.error("unexpected_error", path=request.url.path, exc_info=error)
+    # Starlette calls this outside of all middleware, so the request's id is neither bound nor in the answer yet.
+    correlation = getattr(request.state, "correlation", "")
+    log.error("unexpected_error", path=request.url.path, correlation=correlation, exc_info=error)
     detail = "the service failed; nothing was stored, the log says why"
-    return answer(_problem("internal-error", 500, "The service failed", detail, request))
+    problem = _problem("internal-error", 500, "The service failed", detail, request)
+    return answer(problem, {"X-Correlation-ID": correlation})
 
 
 def _printable(text: str) -> str:

@@ -35,7 +35,7 @@ class Guard:
             await self._app(scope, receive, send)
             return
         request = Request(scope)
-        correlation = _correlation(request)
+        correlation = request.state.correlation = _correlation(request)
         with origin.bound(actor="", correlation=correlation):
             await self._guarded(request, receive, _naming(send, correlation))
 

@@ -42,8 +42,8 @@ def in_use(served: Served, project: str) -> UUID:
             model = TrainedModel(kind, 0, "grid", {}, "0" * 64, 1, {})
             registry.register(session, row.id, current.id, model, current.watermark, now)
         scoring = scorings.start(session, row, "cycle", current, now, held.limits)
-        rounds.begin_training(session, current.id)
-        rounds.begin_scoring(session, current.id)
+        rounds.begin_training(session, current.id, now)
+        rounds.begin_scoring(session, current.id, now)
         rounds.make_current(session, current.id, now)
         for job in session.scalars(select(JobRow).where(JobRow.subject_id.in_([current.id, scoring.id]))):
             job.state = "done"
@@ -53,7 +53,8 @@ def in_use(served: Served, project: str) -> UUID:
 def rank(served: Served, scoring: UUID, ranked: list[tuple[str, int]]) -> None:
     """The scoring's queue, best first; what its jobs would have done is done."""
     with served.services.database.write() as session:
-        scorings.publish(session, scoring, [Ranked(*segment, -number) for number, segment in enumerate(ranked)])
+        queue = [Ranked(*segment, -number) for number, segment in enumerate(ranked)]
+        scorings.publish(session, scoring, queue, served.clock())
 
 
 def test_the_first_batch_waits_for_a_scoring(on_both: Served) -> None:

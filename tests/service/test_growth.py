@@ -32,7 +32,7 @@ def test_a_failed_round_makes_its_labels_due_again(served: Served) -> None:
     batch = served.acquire(project, 3)
     first = UUID(served.label(project, answers(batch), batch).json()["round"])
     with served.services.database.write() as session:
-        rounds.begin_training(session, first)
+        rounds.begin_training(session, first, served.clock())
         rounds.fail(session, first, "the disk was full", served.clock())
     batch = served.acquire(project, 1)
     assert served.label(project, answers(batch), batch).json()["round"] is not None

@@ -186,9 +186,26 @@ def test_explorations_are_drawn_from_all_of_the_pool_by_chance_alone(served: Ser
 def test_where_nothing_can_be_gone_back_to_nothing_is_explored(served: Served) -> None:
     project = served.project()  # a simulator's, whose states are not kept
     served.upload(project, room(0))
-    refused(served.ask(project, 1, mode="explore"), 409, "pool-exhausted")
+    refused(served.ask(project, 1, mode="explore"), 409, "nothing-to-explore", "minigrid")
     body = {"mode": "explore", "purpose": "held_out"}
     refused(served.ask(project, 1, **body), 422, "malformed-request", "held_out")
+
+
+def test_an_exploration_brings_at_least_one_label(served: Served) -> None:
+    project = exploring(served)
+    batch = explore(served, project, 1)
+    refused(report(served, batch, 0, 100, starts=[]), 422, "invalid-label", "starts", 0, "at least 1")
+    assert served.show(project)["counts"]["pool_trajectories"] == 3
+    assert report(served, batch, 0, 100).json()["created"] == 1
+
+
+def test_a_trajectory_that_nobody_asked_for_needs_no_lease_beside_one_that_has_it(served: Served) -> None:
+    project = exploring(served)
+    batch = served.acquire(project, 1, strategy="random")
+    own = {"content": base64.b64encode(npz(pole(100))).decode(), "actions": [0, 1]}
+    answer = served.label(project, answers(batch), batch, trajectories=[own])
+    assert (answer.status_code, answer.json()["created"]) == (201, 2), answer.text
+    assert served.get(f"/acquisitions/{batch['id']}")["status"] == "labeled"
 
 
 def test_what_an_exploration_brings_is_never_held_out(served: Served) -> None:

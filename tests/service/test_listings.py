@@ -25,7 +25,7 @@ def busy(served: Served) -> str:
         row = session.get_one(ProjectRow, UUID(project))
         for number in range(7):
             current = rounds.request(session, row, served.clock())
-            rounds.begin_training(session, current.id)  # one that still waits would be given again
+            rounds.begin_training(session, current.id, served.clock())  # one that still waits would be given again
             model = TrainedModel("ensemble", number, "grid", {}, "0" * 64, 1, {})
             registry.register(session, row.id, current.id, model, 7, served.clock())
     return project

@@ -61,18 +61,18 @@ def test_a_round_is_shown_as_it_goes_and_the_next_takes_its_place(on_both: Serve
     project = labeled(on_both)
     first = requested(on_both, project)
     with on_both.services.database.write() as session:
-        rounds.begin_training(session, first)
+        rounds.begin_training(session, first, on_both.clock())
     second = requested(on_both, project)
     with on_both.services.database.write() as session:
         now = on_both.clock()
         for number, one in enumerate((first, second)):
-            rounds.begin_training(session, one)
+            rounds.begin_training(session, one, now)
             for member, kind in enumerate(("world_model", "ensemble")):
                 model = TrainedModel(kind, member, "grid", {"width": 8}, "ab" * 32, 10, {"loss": 1.0})
                 registry.register(session, UUID(project), one, model, 3, now)
             rounds.stage_done(session, one, "world_model", 1.23456)
             rounds.record_error(session, one, ERROR.model_copy(update={"loss": 3.5 - number}), now)
-            rounds.begin_scoring(session, one)
+            rounds.begin_scoring(session, one, now)
         rounds.make_current(session, second, now)
         rounds.make_current(session, first, now)  # it was overtaken
     shown = on_both.get(f"/rounds/{second}")
