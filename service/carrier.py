@@ -5,6 +5,7 @@ not been sent. A message that is lost is sent again, one that arrives twice find
 """
 
 import threading
+import time
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from uuid import UUID
@@ -21,6 +22,7 @@ from service.store.queries import jobs as queries
 
 log = get_logger("carrier")
 BATCH = 100
+LOOK_SECONDS = 1.0  # between two looks for silent workers and lost messages
 PAUSE_SECONDS = 1.0  # after a broker or a database has failed
 CONNECT_SECONDS = 2.0
 ANSWER_SECONDS = 5.0
@@ -79,11 +81,15 @@ def messages_in(app: Celery, queue: str) -> int:
             raise BrokerError(f"queue {queue}: {error}") from error
 
 
-def relay(database: Database, app: Celery, settings: Settings, now: datetime) -> int:
-    """Send every job that may run and was not sent, or whose message is lost; returns how many."""
+def relay(database: Database, app: Celery, settings: Settings, now: datetime, *, look_for_lost: bool = True) -> int:
+    """Send every job that may run and was not sent, or whose message is lost; returns how many.
+
+    To look for what is lost takes a question to the broker; not every time is needed.
+    """
     with database.read() as session:
         waiting = [(row.id, row.queue) for row in queries.unsent(session, now, BATCH)]
-    waiting += _lost(database, app, settings, now)
+    if look_for_lost:
+        waiting += _lost(database, app, settings, now)
     for job_id, queue in waiting:  # outside any transaction: a broker may take its time
         name = f"{settings.celery_prefix}.{queue}"
         app.send_task(RUN_JOB, [str(job_id)], queue=name, retry=True, retry_policy=PATIENCE)
@@ -133,11 +139,14 @@ class Relay:
         self._thread.join(timeout=10)
 
     def _run(self) -> None:
-        app = impatient_app(self._settings)
+        app, looked = impatient_app(self._settings), 0.0
         while not self._stop.wait(self._settings.poll_seconds):
+            due = time.monotonic() - looked >= LOOK_SECONDS
+            looked = time.monotonic() if due else looked
             try:
-                self._reap()
-                relay(self._database, app, self._settings, self._clock())
+                if due:
+                    self._reap()
+                relay(self._database, app, self._settings, self._clock(), look_for_lost=due)
             except BrokerError as error:  # without its traceback: there may be one a second for an hour
                 log.warning("broker_unreachable", error=str(error))
                 self._stop.wait(PAUSE_SECONDS)

@@ -17,7 +17,6 @@ from api_schemas.labels import (
     LabelItem,
     LabelReceipt,
     LabelsAccepted,
-    LabelSource,
     LabelsRequest,
 )
 from api_schemas.trajectories import SplitChoice
@@ -88,11 +87,13 @@ def accept(
     uploads: the request's labeled trajectories, stored. Raises UnknownResource, InvalidLabel, InvalidLeaseToken,
     LeaseLost, SegmentLeased, LabelConflict, SplitConflict, BudgetExhausted.
     """
+    members = _fitting(session, projects.find(session, request.project), request.items)
     pool.keep(session, [upload.stored for upload in uploads], now)
     project = projects.find(session, request.project, lock=True)
     acquisition = _acquisition(session, project, request)
     uploaded, reserved = _take_uploads(session, project, acquisition, uploads, now)
-    batch = _batch(session, project, request.source, acquisition, uploaded, request.items, now)
+    members |= _fitting(session, project, uploaded)
+    batch = _batch(session, project, request, acquisition, uploaded, members, now)
     for item in (*uploaded, *request.items):
         batch.receipts.append(_accept_item(batch, item))
     _store(session, batch)
@@ -153,26 +154,30 @@ def _take_uploads(
     return taken, reserved
 
 
-def _batch(
-    session: Session,
-    project: ProjectRow,
-    source: LabelSource,
-    acquisition: AcquisitionRow | None,
-    uploaded: Sequence[LabelItem],
-    asked: Sequence[LabelItem],
-    now: datetime,
-) -> _Batch:
-    """A few statements for any number of items, which all fit their segments."""
-    items = (*uploaded, *asked)
+def _fitting(session: Session, project: ProjectRow, items: Sequence[LabelItem]) -> dict[str, Membership]:
+    """The members that the items are about, all of which fit their segments. Needs no lock: none of it ever changes."""
     members = pool_queries.memberships_of(session, project.id, sorted({item.trajectory for item in items}))
     spaces = projects.spaces_of(project)
     for item in items:
         _check_segment(project, spaces, members.get(item.trajectory), item)
-    segments = [(item.trajectory, item.start) for item in items]
+    return members
+
+
+def _batch(
+    session: Session,
+    project: ProjectRow,
+    request: LabelsRequest,
+    acquisition: AcquisitionRow | None,
+    uploaded: Sequence[LabelItem],
+    members: dict[str, Membership],
+    now: datetime,
+) -> _Batch:
+    """What there is of the segments: a few statements for any number of them."""
+    segments = [(item.trajectory, item.start) for item in (*uploaded, *request.items)]
     return _Batch(
         project=project,
         watermark=project.label_watermark,
-        source=source.model_dump(mode="json"),
+        source=request.source.model_dump(mode="json"),
         acquisition=acquisition,
         now=now,
         members=members,
@@ -293,13 +298,12 @@ def _store(session: Session, batch: _Batch) -> None:
         return
     project, pool_labels = batch.project, sum(row["split"] == "pool" for row in batch.created)
     segments = [(str(row["trajectory_id"]), int(str(row["start"]))) for row in batch.created]
-    project.label_watermark = batch.watermark
-    project.pool_labels += pool_labels
-    project.held_out_labels += len(batch.created) - pool_labels
-    session.flush()
     queries.insert(session, batch.created)
     claim_queries.drop_claims(session, project.id, [segment for segment in segments if segment in batch.claims])
     claim_queries.drop_from_queues(session, project.id, segments)
+    project.label_watermark = batch.watermark  # last: a statement after this one would write the row by itself
+    project.pool_labels += pool_labels
+    project.held_out_labels += len(batch.created) - pool_labels
     data: dict[str, object] = {
         "count": len(batch.created),
         "first": batch.created[0]["watermark"],

@@ -72,10 +72,10 @@ def note_expired(session: Session, now: datetime) -> None:
 
 def check_budget(session: Session, project: ProjectRow, added: int, now: datetime) -> None:
     """Raises BudgetExhausted where `added` labels or reservations, in this transaction, went over the budget."""
-    session.flush()
     total = projects.policy_of(project).label_budget
     if total is None:
         return
+    session.flush()
     used = project.pool_labels + queries.reserved(session, project.id, now)
     if used > total:
         raise BudgetExhausted(added, max(0, total - (used - added)), total)

@@ -32,9 +32,14 @@ class Labelers:
 
     def __init__(self, url: str, key: str) -> None:
         self._http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=20.0)
-        self.unanswered = 0
+        self.silences: list[str] = []
         self.unavailable = 0
         self.answers: list[Answered] = []
+
+    @property
+    def unanswered(self) -> int:
+        """How many requests got no answer."""
+        return len(self.silences)
 
     def close(self) -> None:
         """Close the connections."""
@@ -46,8 +51,8 @@ class Labelers:
         while time.monotonic() < deadline:
             try:
                 answer = self._http.post(path, json=request, headers={"Idempotency-Key": key})
-            except httpx.TransportError:
-                self.unanswered += 1
+            except httpx.TransportError as error:
+                self.silences.append(f"{type(error).__name__} at {path}")
                 time.sleep(0.2)
                 continue
             if answer.status_code == 503:

@@ -12,7 +12,9 @@ from tests.crash.deployment import Deployment
 from tests.crash.hammer import Hammer
 from tests.crash.rounds import Rounds
 from tests.figures import Figures
+from tests.loop.processes import eventually
 
+ATTEMPTS = 3  # without progress, after which a kill waits for some
 RECOVERED = 90.0  # seconds until another has the job, at most
 
 
@@ -39,6 +41,7 @@ class Scene:
         """Do it to the process that trains, after `pause` seconds of training; then somebody else has the job."""
         while True:
             holder = self._see(self.rounds.await_training())
+            self._await_progress(holder)
             time.sleep(pause)
             before = self.deployment.job(self.rounds.job)
             if self.deployment.holder_of(self.rounds.job) == holder:
@@ -88,6 +91,15 @@ class Scene:
         self.figures.none("labels lost or doubled", self.deployment.lost_or_doubled(labeled))
         self.figures.add("trainings resumed from a checkpoint", self.resumed(), "times")
         self.figures.add("longest time until another has the job", max(self.recovered), "s", RECOVERED, "below")
+
+    def _await_progress(self, holder: int) -> None:
+        """After two kills before any checkpoint wait for one: the pauses between attempts grow to a minute."""
+
+        def progressed() -> bool:
+            job = self.deployment.job(self.rounds.job)
+            return job.attempts < ATTEMPTS or self.deployment.holder_of(job.id) != holder
+
+        eventually(progressed, RECOVERED, lambda: f"no progress: {self.deployment.last_words()}")
 
     def _see(self, holder: int) -> int:
         """Remember since when this process has the job."""

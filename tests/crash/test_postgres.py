@@ -51,6 +51,8 @@ def test_8_an_upload_that_a_restart_interrupts_is_whole_or_not_there(
     figures.add("labels acknowledged", sum(len(each.acknowledged) for each in hammers.values()), "labels")
     unavailable = sum(each.labelers.unavailable for each in hammers.values())
     figures.add("answers 503 with Retry-After", unavailable, "answers", target=1)
+    silences = Counter(silence for each in hammers.values() for silence in each.labelers.silences)
+    figures.note(f"without an answer: {dict(silences)}")
     figures.none("requests that went unanswered", sum(each.labelers.unanswered for each in hammers.values()))
     figures.add("answers to what had been done before", sum(each.replays for each in hammers.values()), "replays")
 

@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 LONGEST = 3.0  # seconds of training before a kill
 CHECKPOINT_SECONDS = float(SETTINGS["ASIM_CHECKPOINT_SECONDS"])
 SLACK = 5.0  # seconds: a slice of training takes one, on a busy machine several; so does loading
-PATIENT = {"ASIM_JOB_MAX_ATTEMPTS": "30"}  # a kill may come before the first checkpoint, several times in a row
+PATIENT = {"ASIM_JOB_MAX_ATTEMPTS": "5"}  # a kill may come before the first checkpoint, several times in a row
 
 
 @pytest.fixture

@@ -110,7 +110,7 @@ def test_mistakes_cost_one_sentence(asim: Asim, own: str, tmp_path: Path) -> Non
         ("jobs", "nothing"): "no project is named 'nothing'",
         ("events", "nothing"): "no project is named 'nothing'",
         ("cancel", str(UUID(int=3))): f"there is no job '{UUID(int=3)}'",
-        ("acquire", own, "--mode", "explore"): "asked for 16 segments, 0 are unlabeled",
+        ("acquire", own, "--mode", "explore"): "could start from",
         ("acquire", own, "--mode", "explore", "--purpose", "held_out"): "'held_out' cannot be explored",
     }
     for arguments, sentence in mistakes.items():

@@ -9,7 +9,7 @@ import sqlalchemy
 from sqlalchemy import JSON, func, select
 from sqlalchemy.orm import Session
 
-from service.store.queries.segments import Segment, among, parts
+from service.store.queries.segments import Segment, looked_up, parts
 from service.store.tables import LabelRow
 
 if TYPE_CHECKING:
@@ -31,9 +31,8 @@ def labels_of(session: Session, project_id: UUID, segments: Sequence[Segment]) -
         *(LabelRow.content_sha256, LabelRow.actions, LabelRow.action_sets),
     )
     for some in parts(segments):
-        named = among(session, LabelRow.trajectory_id, LabelRow.start, some)
-        rows = session.execute(select(*columns).where(LabelRow.project_id == project_id, named))
-        found |= {(row[0], row[1]): StoredLabel(row[2], row[4] or row[3]) for row in rows}
+        statement = looked_up(session, columns, LabelRow.project_id == project_id, some)
+        found |= {(row[0], row[1]): StoredLabel(row[2], row[4] or row[3]) for row in session.execute(statement)}
     return found
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from sqlalchemy import ARRAY, ColumnElement, Integer, String, bindparam, func, select, tuple_
+from sqlalchemy import ARRAY, ColumnElement, Integer, Select, String, bindparam, func, select, true, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 Segment = tuple[str, int]  # trajectory, start
@@ -23,6 +23,27 @@ def among(
         return tuple_(trajectory, start).in_(segments)
     names, starts = zip(*segments, strict=True) if segments else ((), ())
     return tuple_(trajectory, start).in_(select(_unnested(names, String()), _unnested(starts, Integer())))
+
+
+def looked_up(
+    session: Session,
+    columns: Sequence[InstrumentedAttribute[Any]],
+    where: ColumnElement[bool],
+    segments: Sequence[Segment],
+) -> Select[Any]:
+    """`columns`, of which trajectory and start come first, of the one row that each of these segments has, if any.
+
+    On PostgreSQL each segment is looked up by itself. Left to choose, it reads all rows of the project while it has no
+    statistics yet, that is in the first minutes of a table that grows fast.
+    """
+    trajectory, start = columns[:2]
+    if session.get_bind().dialect.name != "postgresql":
+        return select(*columns).where(where, among(session, trajectory, start, segments))
+    names, starts = zip(*segments, strict=True)
+    arrays = bindparam(None, list(names), ARRAY(String())), bindparam(None, list(starts), ARRAY(Integer()))
+    asked = func.unnest(*arrays).table_valued("trajectory", "start").render_derived()
+    one = select(*columns).where(where, trajectory == asked.c.trajectory, start == asked.c.start).limit(1).lateral()
+    return select(one).select_from(asked).join(one, true())
 
 
 def parts(segments: Sequence[Segment]) -> Iterator[Sequence[Segment]]:
