@@ -44,5 +44,6 @@ def _check_database(settings: Settings) -> None:
 def _celery_argv(settings: Settings, names: list[str]) -> list[str]:
     """A prefork worker of one child; that it is spawned, not forked, stands in workers.app."""
     queues = ",".join(f"{settings.celery_prefix}.{name}" for name in names)
-    options = ["--queues", queues, "--pool", "prefork", "--concurrency", "1", "--loglevel", "INFO"]
+    name = f"asim-{os.getpid()}@%h"  # workers of one machine must not share a name
+    options = ["--hostname", name, "--queues", queues, "--pool", "prefork", "--concurrency", "1", "--loglevel", "INFO"]
     return [sys.executable, "-m", "celery", "--app", "workers.app", "worker", *options]

@@ -5,6 +5,7 @@ from contextlib import asynccontextmanager
 from datetime import datetime
 from importlib.metadata import version
 
+import structlog
 from fastapi import FastAPI
 
 from service.api import acquisitions, jobs, labels, problems, projects, rounds, security, system, trajectories
@@ -12,6 +13,7 @@ from service.api.dependencies import Services
 from service.carrier import Relay
 from service.clock import utc_now
 from service.dashboard import page
+from service.log import configure_logs
 from service.settings import Settings
 from service.store.blobs import Blobs
 from service.store.database import migrate, open_database
@@ -21,6 +23,10 @@ from service.store.provenance import open_provenance
 def create_app(settings: Settings | None = None, clock: Callable[[], datetime] = utc_now) -> FastAPI:
     """The service on its stores. Embedded mode brings its own schema up to date; elsewhere the command line does."""
     settings = settings or Settings()
+    if (
+        not structlog.is_configured()
+    ):  # started by uvicorn itself; structlog's own console takes seconds for a traceback
+        configure_logs()
     app = FastAPI(
         title="ASIM",
         version=version("asim"),

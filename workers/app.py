@@ -71,7 +71,9 @@ def worker() -> Worker:
 
 @worker_process_init.connect  # type: ignore[untyped-decorator]  # celery has no types
 def _prepare_child(**_: object) -> None:
-    end_with(current_process()._parent_pid)  # not os.getppid(): the parent may be gone by now
+    parent = current_process()._parent_pid  # not os.getppid(): the parent may be gone by now
+    if parent is not None:  # None in a solo worker, which does its jobs itself
+        end_with(parent)
     from workers.runner import prepare_science
 
     configure_logs()

@@ -21,7 +21,7 @@ from tests.figures import Figures
 from tests.loop.processes import command_of, eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
-LONGEST = 3.0  # seconds of training before a kill
+LONGEST = 2.0  # seconds of training before a kill
 CHECKPOINT_SECONDS = float(SETTINGS["ASIM_CHECKPOINT_SECONDS"])
 SLACK = 5.0  # seconds: a slice of training takes one, on a busy machine several; so does loading
 PATIENT = {"ASIM_JOB_MAX_ATTEMPTS": "5"}  # a kill may come before the first checkpoint, several times in a row
@@ -86,7 +86,7 @@ def test_3_a_checkpoint_that_is_being_written_does_not_replace_the_one_before(
                 loaded.append(TrainingState.from_bytes(blobs.get("checkpoints", sha256)).step)
 
         for _ in range(REPEAT):
-            scene.strike(strike, chance.uniform(0.0, LONGEST))
+            scene.strike(strike, chance.uniform(0.0, CHECKPOINT_SECONDS))
     scene.finish()
     scene.figures.add("checkpoints that were loaded after a kill", len(loaded), "checkpoints")
     scene.figures.add("kills in the middle of a write", len(half_written(scene.checkpoints)), "files left half written")
