@@ -41,9 +41,16 @@ def test_help_imports_nothing_heavy(command: list[str]) -> None:
     assert printed.splitlines()[-1] == "heavy: []"
 
 
+@pytest.fixture(scope="module")
+def bare() -> float:
+    """Seconds that the help of a typer program takes which does nothing: machines differ, the ratio does not."""
+    program = "import typer\napp = typer.Typer()\napp.command()(lambda count=1: None)\napp()"
+    return min(_seconds([sys.executable, "-c", program, "--help"]) for _ in range(3))
+
+
 @pytest.mark.parametrize("command", [[], ["serve"], ["acquire"]], ids=" ".join)
-def test_help_answers_in_under_half_a_second(command: list[str]) -> None:
-    assert min(_seconds([sys.executable, "-m", "asim", *command, "--help"]) for _ in range(3)) < 0.5
+def test_help_takes_little_more_than_typer_itself(command: list[str], bare: float) -> None:
+    assert min(_seconds([sys.executable, "-m", "asim", *command, "--help"]) for _ in range(3)) < 1.6 * bare
 
 
 def test_the_top_help_needs_no_pydantic() -> None:
