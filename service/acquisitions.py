@@ -13,7 +13,15 @@ from service import draws, events, leases, projects, scorings
 from service.draws import Candidate
 from service.errors import BudgetExhausted, NothingToExplore, PoolExhausted, UnknownStrategy
 from service.store.queries import acquisitions as queries
-from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, JobRow, ProjectRow, QueueRow
+from service.store.tables import (
+    AcquisitionItemRow,
+    AcquisitionRow,
+    ClaimRow,
+    JobRow,
+    ProjectRow,
+    QueueRow,
+    ScoringRow,
+)
 
 
 @dataclass(frozen=True)
@@ -91,10 +99,10 @@ def _known(strategy: str) -> str:
 
 def _front_of_queue(
     session: Session, project: ProjectRow, strategy: str, count: int, now: datetime
-) -> tuple[UUID, Sequence[QueueRow]] | None:
+) -> tuple[ScoringRow, Sequence[QueueRow]] | None:
     """The first free rows of the queue that nobody else reads at this moment, where a queue is ready."""
     scoring = scorings.ready(session, project, strategy)
-    return None if scoring is None else (scoring.id, queries.free_queue(session, scoring, count, now, lock=True))
+    return None if scoring is None else (scoring, queries.free_queue(session, scoring, count, now, lock=True))
 
 
 def _room(session: Session, project: ProjectRow, request: AcquireRequest, now: datetime) -> Room:
@@ -122,21 +130,27 @@ def _draw_ranked(
     project: ProjectRow,
     requested: str,
     room: Room,
-    first: tuple[UUID, Sequence[QueueRow]] | None,
+    first: tuple[ScoringRow, Sequence[QueueRow]] | None,
     now: datetime,
     limits: scorings.Limits,
 ) -> Draw | JobRow:
-    scoring = scorings.usable(session, project, requested, now, limits)
-    if isinstance(scoring, JobRow):
-        return scoring
-    rows: Sequence[QueueRow] = []
-    if first is not None and first[0] == scoring.id:
-        taken = queries.taken_among(session, project.id, [(row.trajectory_id, row.start) for row in first[1]], now)
-        rows = [row for row in first[1] if (row.trajectory_id, row.start) not in taken][: room.count]
-    if len(rows) < room.count:  # others were faster, or the queue is short: look again, now that nobody moves
-        rows = queries.free_queue(session, scoring, room.count, now)
+    if first is not None:
+        scoring, rows = first
+        taken = queries.taken_among(session, project.id, [(row.trajectory_id, row.start) for row in rows], now)
+        rows = [row for row in rows if (row.trajectory_id, row.start) not in taken][: room.count]
+        if len(rows) == room.count:
+            return _ranked(scoring, rows, room)
+    # Others were faster, or the queue is short: look again, now that nobody moves.
+    found = scorings.usable(session, project, requested, now, limits)
+    if isinstance(found, JobRow):
+        return found
+    rows = queries.free_queue(session, found, room.count, now)
     if len(rows) < room.count:
-        return scorings.refill(session, project, scoring, room.count, now, limits)
+        return scorings.refill(session, project, found, room.count, now, limits)
+    return _ranked(found, rows, room)
+
+
+def _ranked(scoring: ScoringRow, rows: Sequence[QueueRow], room: Room) -> Draw:
     candidates = [Candidate(row.trajectory_id, row.start, row.score) for row in rows]
     return Draw(scoring.strategy, candidates, scoring.round_id, room.reason)
 
@@ -172,6 +186,9 @@ def _lease(
     session.flush()
     session.add_all([_item(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
     queries.take_claims(session, [_claim(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
+    if row.mode == "pool" and row.purpose == "pool":
+        segments = [(candidate.trajectory, candidate.start) for candidate in draw.candidates]
+        queries.pass_over(session, project.id, segments, row.lease_expires_at)
     data = {"acquisition": str(row.id), "count": len(draw.candidates), "strategy": row.strategy}
     events.record(session, project.id, "lease.given", data | {"labeler": row.labeler, "mode": row.mode}, now)
     session.flush()

@@ -49,6 +49,7 @@ def release(session: Session, acquisition_id: UUID, token: int, now: datetime) -
     held = queries.claims_of(session, row.id, token)
     for claim in held:
         session.delete(claim)
+    queries.pass_over(session, row.project_id, [(claim.trajectory_id, claim.start) for claim in held], None)
     row.status = "released"
     events.record(session, row.project_id, "lease.released", {"acquisition": str(row.id), "items": len(held)}, now)
     return row

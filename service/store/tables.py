@@ -222,7 +222,10 @@ class ShardRow(Row):
 
 
 class QueueRow(Row):
-    """A ranked segment that POST /acquire may give out."""
+    """A ranked segment that POST /acquire may give out.
+
+    `leased_until` spares it a look at the claims for as long; whether the segment is free is the claims' business.
+    """
 
     __tablename__ = "queue"
     scoring_id: Mapped[UUID] = mapped_column(ForeignKey("scoring.id"), primary_key=True)
@@ -231,6 +234,7 @@ class QueueRow(Row):
     trajectory_id: Mapped[str] = mapped_column(String(64))
     start: Mapped[int]
     score: Mapped[float | None]
+    leased_until: Mapped[datetime | None]
     __table_args__ = (Index("ix_queue_segment", "project_id", "trajectory_id", "start"),)
 
 

@@ -45,8 +45,9 @@ def free_queue(
         ClaimRow.start == QueueRow.start,
         live_claim(now),
     )
+    awake = or_(QueueRow.leased_until.is_(None), QueueRow.leased_until <= now)
     # Not outer joins: without statistics PostgreSQL joins them by the claims' expiry, every claim to every row.
-    statement = select(QueueRow).where(QueueRow.scoring_id == scoring.id, ~label.exists(), ~claim.exists())
+    statement = select(QueueRow).where(QueueRow.scoring_id == scoring.id, awake, ~label.exists(), ~claim.exists())
     statement = statement.order_by(QueueRow.rank).limit(count)
     return session.scalars(statement.with_for_update(of=QueueRow, skip_locked=True) if lock else statement).all()
 
@@ -150,6 +151,16 @@ def drop_from_queues(session: Session, project_id: UUID, segments: Sequence[Segm
         rows = select(QueueRow.scoring_id, QueueRow.rank).where(QueueRow.project_id == project_id, named)
         gone = tuple_(QueueRow.scoring_id, QueueRow.rank).in_(rows.with_for_update(skip_locked=True))
         session.execute(delete(QueueRow).where(gone).execution_options(synchronize_session=False))
+
+
+def pass_over(session: Session, project_id: UUID, segments: Sequence[Segment], until: datetime | None) -> None:
+    """Note in the queues that the segments are leased until then, or no longer, as far as nobody reads them now."""
+    for some in parts(segments):
+        named = among(session, QueueRow.trajectory_id, QueueRow.start, some)
+        rows = select(QueueRow.scoring_id, QueueRow.rank).where(QueueRow.project_id == project_id, named)
+        noted = tuple_(QueueRow.scoring_id, QueueRow.rank).in_(rows.with_for_update(skip_locked=True))
+        change = update(QueueRow).where(noted).values(leased_until=until)
+        session.execute(change.execution_options(synchronize_session=False))
 
 
 def replace_queue(session: Session, scoring: ScoringRow, rows: Sequence[QueueRow]) -> None:

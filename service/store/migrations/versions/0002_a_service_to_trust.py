@@ -63,6 +63,8 @@ def downgrade() -> None:
     with op.batch_alter_table("acquisition") as table:
         table.drop_column("reason")
         table.drop_column("mode")
+    with op.batch_alter_table("queue") as table:
+        table.drop_column("leased_until")
     with op.batch_alter_table("project") as table:
         for name in COUNTERS:
             table.drop_column(name)
@@ -78,6 +80,7 @@ def _add_nullable() -> None:
     for table, name, length in TEXTS:
         op.add_column(table, sa.Column(name, sa.String(length=length), nullable=True))
     op.add_column("event", sa.Column("transaction", sa.BigInteger(), nullable=True))
+    op.add_column("queue", sa.Column("leased_until", service.store.tables.UtcDateTime(timezone=True), nullable=True))
     op.add_column("acquisition", sa.Column("reason", sa.String(), nullable=True))
     op.add_column("acquisition_item", sa.Column("actions", sa.JSON(none_as_null=True), nullable=True))
     op.add_column("acquisition_item", sa.Column("answer", sa.String(length=64), nullable=True))
