@@ -101,6 +101,8 @@ def make_current(session: Session, round_id: UUID, now: datetime) -> None:
         if current is not None:
             current.status = "superseded"
             session.flush()  # before the other: at no moment are there two
+            data: dict[str, object] = {"round": str(current.id), "number": current.number}
+            events.record(session, row.project_id, "round.superseded", data, now)
         row.status = "current"
     row.finished_at = now
     events.record(session, row.project_id, f"round.{row.status}", {"round": str(row.id), "number": row.number}, now)

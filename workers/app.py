@@ -48,7 +48,7 @@ def served_queues(arguments: list[str]) -> tuple[str, ...]:
 
 
 def settings_for(queues: tuple[str, ...]) -> Settings:
-    """The environment's settings; simulator states are in reach of a worker that serves `label` only."""
+    """The environment's settings; simulator states are out of reach of a worker that does not serve `label`."""
     given = Settings()
     return given if "label" in queues else given.model_copy(update={"provenance_url": ""})
 

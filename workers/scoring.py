@@ -47,7 +47,7 @@ def run_shard(job: RunningJob, payload: ScoreShard) -> dict[str, object]:
         members = [member for member in members if member.segments]
         windows = data.windows_of(session, project, members, None) if scorings.NEEDS[scoring.strategy] else []
         generator = _generator(session, project, scoring, f"shard {payload.shard}")
-    if shard.blob_sha256 is not None:
+    if shard.blob_sha256 is not None or scoring.status == "failed":  # failed: nobody will read these scores
         return {"scored": 0}
     if windows:
         scores = _scores(job, project, scoring, windows, generator)

@@ -13,7 +13,7 @@ from models.network import Network
 from models.segments import SegmentBatch
 from models.training import TrainingConfig, TrainingState, advance, begin
 from service import events, jobs
-from service.errors import ServiceError
+from service.errors import CorruptBlob, MissingBlob, ServiceError
 from service.log import get_logger
 from service.store.tables import JobRow
 from workers.job import GaveWay, RunningJob
@@ -82,7 +82,7 @@ class Stage:
             return None
         try:
             state = TrainingState.from_bytes(self._job.worker.blobs.get("checkpoints", row.checkpoint_sha256))
-        except (ServiceError, ValueError) as error:
+        except (MissingBlob, CorruptBlob, ValueError) as error:  # a store that is away for now is another attempt's
             log.warning("checkpoint_unusable", stage=self._name, error=str(error))
             return None
         if state.config != config:

@@ -48,7 +48,7 @@ def revoke_key(key_id: UUID, session: WriteSession, now: Now) -> None:
 
 
 @router.get("/health/live")
-def live() -> dict[str, str]:
+async def live() -> dict[str, str]:
     return {"status": "ok"}
 
 

@@ -15,8 +15,9 @@ def current_round(session: Session, project_id: UUID) -> RoundRow | None:
 
 
 def queued_rounds(session: Session, project_id: UUID) -> Sequence[RoundRow]:
-    """Rounds whose job no worker has begun."""
-    return session.scalars(select(RoundRow).where(RoundRow.project_id == project_id, RoundRow.status == "queued")).all()
+    """Rounds whose job no worker has begun, locked: none begins while they are superseded."""
+    statement = select(RoundRow).where(RoundRow.project_id == project_id, RoundRow.status == "queued")
+    return session.scalars(statement.with_for_update().execution_options(populate_existing=True)).all()
 
 
 def last_number(session: Session, project_id: UUID) -> int:
