@@ -17,6 +17,7 @@ from models.segments import Segment, SegmentBatch, concatenate
 from service import projects
 from service.store import codec
 from service.store.blobs import Blobs
+from service.store.database import Database
 from service.store.queries import labels as label_queries
 from service.store.queries import pool as pool_queries
 from service.store.tables import LabelRow, MembershipRow, ProjectRow
@@ -102,13 +103,14 @@ def _groups(windows: Sequence[Windows]) -> Iterator[list[Windows]]:
 
 
 def labeled_batch(
-    session: Session, blobs: Blobs, project: ProjectRow, split: str, watermark: int
+    database: Database, blobs: Blobs, project: ProjectRow, split: str, watermark: int
 ) -> SegmentBatch | None:
     """All labeled segments of a split up to a watermark, in the order of acceptance; None where there are none."""
-    rows = label_queries.labels_up_to(session, project.id, split, watermark)
+    with database.read() as session:  # ended before the first blob is read: a database ends those that sit idle
+        rows = label_queries.labels_up_to(session, project.id, split, watermark)
+        contents = pool_queries.contents(session, sorted({row.trajectory_id for row in rows}))
     if not rows:
         return None
-    contents = pool_queries.contents(session, sorted({row.trajectory_id for row in rows}))
     windows = [Windows(row.trajectory_id, contents[row.trajectory_id].blob_sha256, (row.start,)) for row in rows]
     batch = load_in_order(blobs, windows, project.segment_length)
     action = projects.spaces_of(project).actions

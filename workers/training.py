@@ -109,8 +109,7 @@ def _family(project: ProjectRow) -> Family:
 
 
 def _labels(job: RunningJob, plan: Plan, split: str) -> SegmentBatch | None:
-    with job.worker.database.read() as session:
-        return data.labeled_batch(session, job.worker.blobs, plan.project, split, plan.round.watermark)
+    return data.labeled_batch(job.worker.database, job.worker.blobs, plan.project, split, plan.round.watermark)
 
 
 def _train_stage(job: RunningJob, plan: Plan, kind: str, member: int, labeled: SegmentBatch, number: int) -> None:
