@@ -6,7 +6,7 @@ from api_schemas.base import Schema, Timestamp
 
 
 class Event(Schema):
-    """One state change. A listing by rising `id` never gets an event before an older one that it has not shown.
+    """One state change. A listing by rising `id` leaves out, for the moment, what open transactions may still precede.
 
     actor: who did it: the name of an API key, "local" in embedded mode, a worker, the reaper.
     correlation: the `X-Correlation-ID` of the request that it goes back to. `data` depends on `kind`.

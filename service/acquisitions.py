@@ -1,7 +1,7 @@
 """Acquisitions: batches given out under a lease: segments of a ranked queue, held-out segments, or explorations."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from uuid import UUID
 
@@ -39,7 +39,7 @@ class Room:
     """How many items can be given out, and what stands in the way of more."""
 
     count: int
-    reason: str | None = field(default=None)
+    reason: str | None = None
 
 
 def acquire(

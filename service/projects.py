@@ -92,7 +92,7 @@ class SplitCount:
 
 
 def split_count(session: Session, row: ProjectRow, split: str, now: datetime) -> SplitCount:
-    """Counts of one split at `now`, from the project's counters: at any size as quick."""
+    """Counts of one split at `now`, from the project's counters; only live leases are counted."""
     leased = pool_queries.leased(session, row.id, split, now)
     if split == "pool":
         return SplitCount(row.pool_trajectories, row.pool_segments, leased, row.pool_labels)
