@@ -14,7 +14,6 @@ from torch import Tensor
 
 from models.network import Network
 from models.segments import SegmentBatch
-from models.subgoal_generators.base import SubgoalGenerator
 
 Progress = Callable[[int, int, float], None]
 PROGRESS_EVERY = 25  # steps
@@ -94,21 +93,6 @@ def train(
     return TrainingResult(state.step, sum(state.recent) / len(state.recent))
 
 
-def train_subgoal_generator(
-    model: SubgoalGenerator,
-    dataset: SegmentBatch,
-    state: TrainingState,
-    steps: int,
-    device: torch.device | str = "cpu",
-    progress: Progress | None = None,
-) -> TrainingState:
-    """One slice of at most `steps` steps from `state` (see `begin`) on action-free segments.
-
-    Slices of any length give bitwise the weights of one uninterrupted run. Done when state.step == state.config.steps.
-    """
-    return advance(model, dataset, state, min(state.step + steps, state.config.steps), device, progress)
-
-
 def begin(model: Network, config: TrainingConfig, generator: torch.Generator) -> TrainingState:
     """The state before the first step; later draws continue from the generator's state at this moment."""
     tensors = {f"model.{name}": tensor.detach().clone() for name, tensor in model.state_dict().items()}
@@ -125,7 +109,10 @@ def advance(
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
 ) -> TrainingState:
-    """Trains from `state` to step `until`; the model, in place, takes the state's weights first."""
+    """Trains from `state` to step `until`; the model, in place, takes the state's weights first.
+
+    Slices of any length give bitwise the weights of one uninterrupted run.
+    """
     _check_dataset(model, dataset)
     model.to(device)
     run = _Run(model, dataset.to(device), state)

@@ -6,7 +6,7 @@ import torch
 
 from models.families import GRID
 from models.segments import Observations, SegmentBatch
-from models.training import TrainingConfig, begin, train_subgoal_generator
+from models.training import TrainingConfig, advance, begin
 from tests.science import toy_grid
 
 
@@ -31,14 +31,14 @@ def test_a_batch_with_actions_is_refused(training_set: SegmentBatch) -> None:
 
 def begin_and_train(dataset: SegmentBatch) -> None:
     model = GRID.build_subgoal_generator(toy_grid.SPACES, None, torch.Generator().manual_seed(0))
-    train_subgoal_generator(model, dataset, begin(model, TrainingConfig(1, 1, 1.0, 0.0), torch.Generator()), 1)
+    advance(model, dataset, begin(model, TrainingConfig(1, 1, 1.0, 0.0), torch.Generator()), 1)
 
 
 def test_samples_follow_the_distribution_of_what_came_next() -> None:
     state, dataset = _one_room([0, 0, 0, 1], copies=64)  # three in four turn left, one in four turns right
     model = GRID.build_subgoal_generator(toy_grid.SPACES, None, torch.Generator().manual_seed(0))
     config = TrainingConfig(100, 64, 1e-2, 1e-4)
-    train_subgoal_generator(model, dataset, begin(model, config, torch.Generator().manual_seed(1)), config.steps)
+    advance(model, dataset, begin(model, config, torch.Generator().manual_seed(1)), config.steps)
     many = {name: stream.expand(400, *stream.shape[1:]) for name, stream in state.items()}
     chain = model.sample(many, 1, torch.Generator().manual_seed(2))
     assert torch.equal(chain["grid"][:, 0], many["grid"])

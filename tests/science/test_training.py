@@ -11,10 +11,10 @@ from models.training import (
     NonFiniteError,
     TrainingConfig,
     TrainingState,
+    advance,
     begin,
     learning_rate,
     train,
-    train_subgoal_generator,
 )
 from tests.science import toy_grid
 
@@ -41,11 +41,12 @@ def test_interrupted_training_equals_uninterrupted_training(
     dataset = training_set.take(slice(0, 50)).without_labels()
     whole = GRID.build_subgoal_generator(toy_grid.SPACES, None, torch.Generator().manual_seed(0))
     start = begin(whole, CONFIG, torch.Generator().manual_seed(7))
-    end = train_subgoal_generator(whole, dataset, start, CONFIG.steps)
+    end = advance(whole, dataset, start, CONFIG.steps)
     data = start.to_bytes()
     for steps in slices:  # each slice in a network of its own, as another process would
         fresh = GRID.build_subgoal_generator(toy_grid.SPACES, None, torch.Generator().manual_seed(99))
-        data = train_subgoal_generator(fresh, dataset, TrainingState.from_bytes(data), steps).to_bytes()
+        state = TrainingState.from_bytes(data)
+        data = advance(fresh, dataset, state, min(state.step + steps, CONFIG.steps)).to_bytes()
     resumed = TrainingState.from_bytes(data)
     assert resumed.step == end.step == CONFIG.steps
     assert resumed.recent == end.recent
