@@ -6,7 +6,7 @@ from api_schemas.base import Schema, Timestamp
 
 
 class Event(Schema):
-    """One state change. A listing by rising `id` leaves out, for the moment, what open transactions may still precede.
+    """One state change. Listed oldest first they can be followed: one that is shown has all before it.
 
     actor: who did it: the name of an API key, "local" in embedded mode, a worker, the reaper.
     correlation: the `X-Correlation-ID` of the request that it goes back to. `data` depends on `kind`.

@@ -34,10 +34,14 @@ class TrainRound(Schema):
 
 
 class TrainSubgoalGenerator(Schema):
-    """Train the project's subgoal generator on action-free observations; gives way to waiting work."""
+    """Train the project's subgoal generator on action-free observations; gives way to waiting work.
+
+    memberships: the pool's members up to this id are trained on; None, as in older jobs, is all of them.
+    """
 
     kind: Literal["train_subgoal_generator"] = "train_subgoal_generator"
     project: UUID
+    memberships: int | None = None
 
 
 class ScoreShard(Schema):

@@ -9,6 +9,7 @@ from api_schemas.base import Schema, Split, Timestamp, TrajectoryId
 from api_schemas.trajectories import SplitChoice
 
 Action = StrictInt | list[float]
+MOST_SEGMENTS = 20_000  # that the labeled trajectories of one request may bring
 
 
 class LabelSource(Schema):
@@ -36,7 +37,8 @@ class LabeledTrajectory(Schema):
     """A whole trajectory with its actions: seed data, held-out data, a demonstration. No lease is needed.
 
     content: base64 of an npz file with one array a stream, time first, T + 1 observations.
-    actions: T actions. starts: record only the segments that begin there; default all of them.
+    actions: T actions. starts: record only the segments that begin there, each once; default all of them. A request
+        records at most 20,000 segments of trajectories.
     rank: the explore item of the request's acquisition that this trajectory answers; None where nobody asked for it.
     """
 
@@ -46,6 +48,12 @@ class LabeledTrajectory(Schema):
     starts: list[int] | None = None
     split: SplitChoice = "auto"
     rank: int | None = Field(default=None, ge=0)
+
+    @model_validator(mode="after")
+    def _each_segment_once(self) -> "LabeledTrajectory":
+        if self.starts is not None and len(set(self.starts)) < len(self.starts):
+            raise ValueError("starts: names a segment more than once")
+        return self
 
     @model_validator(mode="after")
     def _exploration_trains(self) -> "LabeledTrajectory":

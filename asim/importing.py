@@ -7,7 +7,8 @@ from uuid import UUID
 
 import numpy as np
 
-from api_schemas.labels import LabeledTrajectory, LabelsAccepted, LabelSource, LabelsRequest
+from api_schemas.labels import MOST_SEGMENTS, LabeledTrajectory, LabelsAccepted, LabelSource, LabelsRequest
+from api_schemas.projects import Project
 from api_schemas.trajectories import SplitChoice
 from asim.arrays import pack, unpack
 from asim.batches import batches
@@ -30,12 +31,34 @@ def has_actions(path: Path) -> bool:
 def add_labeled(
     client: Client, project: UUID, paths: Sequence[Path], split: SplitChoice
 ) -> Iterator[tuple[int, LabelsAccepted]]:
-    """Post the files as labeled trajectories, a batch after the other; how many it held, and what became of it."""
-    read = (_labeled_trajectory(path, split) for path in paths)
-    source = LabelSource(kind="import", name="asim import")
-    for batch in batches(read, lambda one: len(one.content), BATCH_FILES, BATCH_BYTES):
+    """Post the files as labeled trajectories, a batch after the other; how many it held, and what became of it.
+
+    A file with more segments than one request may bring is sent more than once, each time with others of them.
+    """
+    known, source = client.project(project), LabelSource(kind="import", name="asim import")
+    read = (piece for path in paths for piece in _pieces(_labeled_trajectory(path, split), known))
+    for batch in batches(read, lambda one: _size(one, known), BATCH_FILES, BATCH_BYTES):
         accepted = client.label(LabelsRequest(project=project, source=source, trajectories=batch))
         yield len(batch), accepted
+
+
+def _pieces(one: LabeledTrajectory, project: Project) -> Iterator[LabeledTrajectory]:
+    starts = _starts(one, project)
+    if len(starts) <= MOST_SEGMENTS:
+        yield one
+        return
+    for first in range(0, len(starts), MOST_SEGMENTS):
+        yield one.model_copy(update={"starts": list(starts[first : first + MOST_SEGMENTS])})
+
+
+def _starts(one: LabeledTrajectory, project: Project) -> Sequence[int]:
+    """Of the segments that it brings."""
+    return range(0, len(one.actions) - project.segment_length + 1, project.stride) if one.starts is None else one.starts
+
+
+def _size(one: LabeledTrajectory, project: Project) -> int:
+    """Bytes, or as many as its segments take up of what one request may bring."""
+    return max(len(one.content), len(_starts(one, project)) * BATCH_BYTES // MOST_SEGMENTS)
 
 
 def _labeled_trajectory(path: Path, split: SplitChoice) -> LabeledTrajectory:

@@ -7,7 +7,7 @@ from api_schemas.projects import Project
 from asim.client import Client
 from asim.errors import AsimError
 from asim.report import Report
-from workers.labeling import UnexplainedStep, run_labeling
+from workers.labeling import UnanswerableItem, run_labeling
 
 
 def given(client: Client, project: Project, acquisition: str, token: int | None) -> Acquisition:
@@ -29,7 +29,7 @@ def answer(client: Client, batch: Acquisition, seed: int, report: Report) -> Non
     with report.step(what.format(len(batch.items), batch.strategy)) as advance:
         try:
             accepted = run_labeling(client, batch, generator, lambda done, all_: advance(done / all_, ""))
-        except UnexplainedStep as error:
+        except UnanswerableItem as error:
             raise AsimError(str(error)) from error
     report.tell(f"{accepted.created} labels accepted, {accepted.duplicates} known before")
     if accepted.round is not None:

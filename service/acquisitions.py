@@ -8,11 +8,15 @@ from uuid import UUID
 from sqlalchemy.orm import Session
 
 from api_schemas.acquisitions import AcquireRequest, Acquisition, AcquisitionItem
+from api_schemas.projects import Budget
 from api_schemas.strategies import STRATEGY_NAMES
 from service import draws, events, leases, projects, scorings
+from service.clock import Clock
 from service.draws import Candidate
 from service.errors import BudgetExhausted, NothingToExplore, PoolExhausted, UnknownStrategy
 from service.store.queries import acquisitions as queries
+from service.store.queries import pool as pool_queries
+from service.store.queries.pool import Leased
 from service.store.tables import (
     AcquisitionItemRow,
     AcquisitionRow,
@@ -42,36 +46,51 @@ class Room:
     reason: str | None = None
 
 
-def acquire(
-    session: Session, request: AcquireRequest, now: datetime, limits: scorings.Limits
-) -> AcquisitionRow | JobRow:
-    """The next batch, or the job to wait for where no ranked queue is ready.
+def acquire(session: Session, request: AcquireRequest, clock: Clock, limits: scorings.Limits) -> Acquisition | JobRow:
+    """The next batch, as who asked for it is told, or the job to wait for where no ranked queue is ready.
 
     Whoever asks at the same time reads other rows of the queue (SKIP LOCKED); under the project's lock, which all take
-    one after the other for the short rest, nothing is given out that another has taken meanwhile.
+    one after the other for the short rest, nothing is given out that another has taken meanwhile. What time it is, too,
+    is asked under the lock: waiting for it takes time.
     Raises UnknownResource, UnknownStrategy, PoolExhausted, BudgetExhausted.
     """
     project = projects.find(session, request.project)
     requested = _known(request.strategy or projects.policy_of(project).strategy)
     ranked = request.purpose == "pool" and request.mode == "pool"
-    first = _front_of_queue(session, project, requested, request.count, now) if ranked else None
-    project = projects.find(session, request.project, lock=True)
-    room = _room(session, project, request, now)
-    if request.mode == "explore":
-        drawn: Draw | JobRow = _draw_explorations(session, project, room)
+    first = _front_of_queue(session, project, requested, request.count, clock()) if ranked else None
+    states = draws.states(session, project) if request.mode == "explore" else None
+    project, now = projects.find(session, request.project, lock=True), clock()
+    leased = pool_queries.leased(session, project.id, now)
+    room = _room(project, request, leased)
+    if states is not None:
+        drawn: Draw | JobRow = _draw_explorations(project, states, room)
     elif request.purpose == "held_out":
         drawn = Draw("random", draws.held_out(session, project, room.count, now), reason=room.reason)
     else:
         drawn = _draw_ranked(session, project, requested, room, first, now, limits)
     if isinstance(drawn, JobRow):
         return drawn
-    return _lease(session, project, request, requested, drawn, now)
+    row, items = _lease(session, project, request, requested, drawn, now)
+    budget = projects.budget_of(project, _with(leased, row, len(items)))
+    return _told(project, row, [(item, None) for item in items], budget, now, with_token=True)
 
 
 def describe(session: Session, row: AcquisitionRow, now: datetime, *, with_token: bool) -> Acquisition:
     """The acquisition as the API shows it; the token only to the one who has just acquired it."""
     project = projects.find(session, row.project_id)
-    items = [_shown(project, item, label) for item, label in queries.items_with_labels(session, row.id)]
+    budget = projects.budget_of(project, pool_queries.leased(session, project.id, now))
+    return _told(project, row, queries.items_with_labels(session, row.id), budget, now, with_token=with_token)
+
+
+def _told(
+    project: ProjectRow,
+    row: AcquisitionRow,
+    items: Sequence[tuple[AcquisitionItemRow, UUID | None]],
+    budget: Budget,
+    now: datetime,
+    *,
+    with_token: bool,
+) -> Acquisition:
     expired = row.status == "leased" and row.lease_expires_at <= now
     fields = {
         name: getattr(row, name)
@@ -85,8 +104,8 @@ def describe(session: Session, row: AcquisitionRow, now: datetime, *, with_token
         round=row.round_id,
         status="expired" if expired else row.status,  # type: ignore[arg-type]  # pydantic checks the literal
         token=row.token if with_token else None,
-        items=items,
-        budget=projects.budget_of(session, project, now),
+        items=[_shown(project, item, label) for item, label in items],
+        budget=budget,
         **fields,
     )
 
@@ -105,16 +124,16 @@ def _front_of_queue(
     return None if scoring is None else (scoring, queries.free_queue(session, scoring, count, now, lock=True))
 
 
-def _room(session: Session, project: ProjectRow, request: AcquireRequest, now: datetime) -> Room:
+def _room(project: ProjectRow, request: AcquireRequest, leased: Leased) -> Room:
     """What of the asked count budget and split allow; call it under the project's lock."""
     room = Room(request.count)
     if request.mode == "pool":
-        free = projects.split_count(session, project, request.purpose, now).free
+        free = projects.split_count(project, request.purpose, leased).free
         if free < 1:
             raise PoolExhausted(request.count, 0, request.purpose)
         if free < room.count:
             room = Room(free, f"{request.count} were asked for, {free} are left in the {request.purpose} split")
-    budget = projects.budget_of(session, project, now)
+    budget = projects.budget_of(project, leased)
     if request.purpose == "held_out" or budget.total is None or budget.remaining is None:
         return room
     if budget.remaining < 1:
@@ -136,8 +155,8 @@ def _draw_ranked(
 ) -> Draw | JobRow:
     if first is not None:
         scoring, rows = first
-        taken = queries.taken_among(session, project.id, [(row.trajectory_id, row.start) for row in rows], now)
-        rows = [row for row in rows if (row.trajectory_id, row.start) not in taken][: room.count]
+        free = queries.still_free(session, scoring, rows, now)
+        rows = [row for row in rows if row.rank in free][: room.count]
         if len(rows) == room.count:
             return _ranked(scoring, rows, room)
     # Others were faster, or the queue is short: look again, now that nobody moves.
@@ -155,9 +174,9 @@ def _ranked(scoring: ScoringRow, rows: Sequence[QueueRow], room: Room) -> Draw:
     return Draw(scoring.strategy, candidates, scoring.round_id, room.reason)
 
 
-def _draw_explorations(session: Session, project: ProjectRow, room: Room) -> Draw:
+def _draw_explorations(project: ProjectRow, states: draws.States, room: Room) -> Draw:
     """States of the pool and actions to execute there, both drawn uniformly: no model proposes any yet."""
-    candidates = draws.explorations(session, project, room.count)
+    candidates = draws.explorations(project, states, room.count)
     if not candidates:
         raise NothingToExplore(project.id, projects.environment_of(project).simulator)
     return Draw("random", candidates, reason=room.reason)
@@ -165,7 +184,7 @@ def _draw_explorations(session: Session, project: ProjectRow, room: Room) -> Dra
 
 def _lease(
     session: Session, project: ProjectRow, request: AcquireRequest, requested: str, draw: Draw, now: datetime
-) -> AcquisitionRow:
+) -> tuple[AcquisitionRow, list[AcquisitionItemRow]]:
     project.token += 1
     seconds = request.lease_seconds or projects.policy_of(project).lease_seconds
     row = AcquisitionRow(
@@ -184,15 +203,21 @@ def _lease(
     )
     session.add(row)
     session.flush()
-    session.add_all([_item(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
+    items = [_item(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)]
+    session.add_all(items)
     queries.take_claims(session, [_claim(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
     if row.mode == "pool" and row.purpose == "pool":
         segments = [(candidate.trajectory, candidate.start) for candidate in draw.candidates]
         queries.pass_over(session, project.id, segments, row.lease_expires_at)
     data = {"acquisition": str(row.id), "count": len(draw.candidates), "strategy": row.strategy}
     events.record(session, project.id, "lease.given", data | {"labeler": row.labeler, "mode": row.mode}, now)
-    session.flush()
-    return row
+    return row, items
+
+
+def _with(leased: Leased, row: AcquisitionRow, count: int) -> Leased:
+    """What is leased once this batch is, too."""
+    kind = "explore" if row.mode == "explore" else row.purpose
+    return leased._replace(**{kind: getattr(leased, kind) + count})
 
 
 def _item(row: AcquisitionRow, rank: int, candidate: Candidate) -> AcquisitionItemRow:

@@ -52,7 +52,7 @@ def open_services(settings: Settings, clock: Callable[[], datetime] = utc_now) -
         migrate(url)
     return Services(
         settings=settings,
-        database=open_database(url),
+        database=open_database(url, settings.pool_size),
         blobs=Blobs(settings.resolved_blobs_url()),
         provenance=open_provenance(settings),
         clock=clock,

@@ -39,10 +39,15 @@ def ages(session: Session, now: datetime) -> dict[str, float | None]:
 
 
 def healthy(session: Session, now: datetime, within: float) -> dict[str, bool]:
-    """By queue, whether its canary was done lately, or one of its workers is at work: that one will come to it."""
-    at_work = queries.queues_at_work(session, now)
-    known = ages(session, now)
-    return {queue: queue in at_work or _young(known[queue], within) for queue in QUEUES}
+    """By queue, whether its canary or any other job was done lately, or one of its workers is at work.
+
+    A canary may be late where work gets done: it waits its turn behind messages that were sent before it.
+    """
+    at_work, known, since = queries.queues_at_work(session, now), ages(session, now), now - timedelta(seconds=within)
+    return {
+        queue: _young(known[queue], within) or queue in at_work or queries.done_since(session, queue, since)
+        for queue in QUEUES
+    }
 
 
 def done(now: datetime) -> dict[str, object]:

@@ -5,7 +5,11 @@ from uuid import UUID
 
 from sqlalchemy.orm import Session
 
+from api_schemas.jobs import TrainRound
 from service import jobs, rounds, scorings
+from service.errors import JobFinished
+from service.store.queries import acquisitions as acquisition_queries
+from service.store.queries import jobs as job_queries
 from service.store.tables import JobRow
 
 
@@ -14,6 +18,7 @@ def cancel(session: Session, job_id: UUID, now: datetime) -> JobRow:
 
     Its round is cancelled, its scoring failed. Cancelled already, it stays so. Raises UnknownResource, JobFinished.
     """
+    _check_successor(session, jobs.find(session, job_id))
     row = jobs.cancel(session, job_id, now)
     if row.kind == "train_round":
         rounds.cancel(session, row.subject_id, now)
@@ -22,8 +27,18 @@ def cancel(session: Session, job_id: UUID, now: datetime) -> JobRow:
     return row
 
 
+def _check_successor(session: Session, row: JobRow) -> None:
+    """Who cancels a round by its training, which is done, is told which job to cancel. Raises JobFinished."""
+    payload = jobs.payload_of(row)
+    if row.state == "done" and row.project_id is not None and isinstance(payload, TrainRound):
+        scoring = acquisition_queries.newest_scoring(session, row.project_id, payload.strategy, payload.round)
+        at_work = None if scoring is None else job_queries.unfinished(session, scoring.id)
+        if at_work is not None:
+            raise JobFinished(row.id, row.state, at_work.id)
+
+
 def _cancel_scoring(session: Session, scoring_id: UUID, now: datetime) -> None:
     scorings.fail(session, scoring_id, now)
     round_id = scorings.find(session, scoring_id).round_id
-    if round_id is not None and rounds.find(session, round_id, lock=True).status == "scoring":
-        rounds.cancel(session, round_id, now)
+    if round_id is not None:  # one that is in use has another scoring cancelled, and stays in use
+        rounds.cancel(session, round_id, now, while_in=("scoring",))

@@ -8,12 +8,14 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import datetime, timedelta
+from functools import partial
+from typing import get_args
 from uuid import UUID
 
 from celery import Celery
 from kombu.exceptions import OperationalError as BrokerError
 
-from api_schemas.jobs import RUN_JOB
+from api_schemas.jobs import RUN_JOB, Queue
 from service import canary, reaper
 from service.log import get_logger
 from service.settings import Settings
@@ -45,7 +47,9 @@ def celery_app(settings: Settings, *, current: bool = True) -> Celery:
         worker_proc_alive_timeout=120,
         worker_soft_shutdown_timeout=30,
         worker_hijack_root_logger=False,
-        worker_cancel_long_running_tasks_on_connection_loss=True,
+        # A worker that loses the broker goes on with its job: a restart of the broker shall cost no attempt. What it
+        # cannot acknowledge any more comes again, finds the job claimed or done, and is dropped.
+        worker_cancel_long_running_tasks_on_connection_loss=False,
         broker_connection_retry_on_startup=True,
         broker_connection_max_retries=None,  # a worker outlives a broker that is away for long
         broker_transport_options=_transport_options(settings),
@@ -100,12 +104,14 @@ def relay(database: Database, app: Celery, settings: Settings, now: datetime, *,
 
 def _lost(database: Database, app: Celery, settings: Settings, now: datetime) -> list[tuple[UUID, str]]:
     """Jobs that nobody claimed since they were sent, where the broker holds no message that could still arrive."""
+    sent_before = now - timedelta(seconds=settings.resend_seconds)
     with database.read() as session:
-        sent_before = now - timedelta(seconds=settings.resend_seconds)
-        unclaimed = [(row.id, row.queue) for row in queries.unclaimed(session, now, sent_before, BATCH)]
-    queues, prefix = {queue for _, queue in unclaimed}, settings.celery_prefix
-    empty = {queue for queue in queues if messages_in(app, f"{prefix}.{queue}") == 0}
-    return [(job_id, queue) for job_id, queue in unclaimed if queue in empty]
+        neglected = queries.neglected_queues(session, get_args(Queue), sent_before, now)
+    empty = [queue for queue in neglected if messages_in(app, f"{settings.celery_prefix}.{queue}") == 0]
+    with database.read() as session:  # queue by queue: a backlog in one hides nothing of another
+        return [
+            (row.id, queue) for queue in empty for row in queries.unclaimed(session, queue, now, sent_before, BATCH)
+        ]
 
 
 def _transport_options(settings: Settings) -> dict[str, object]:
@@ -143,18 +149,27 @@ class Relay:
         while not self._stop.wait(self._settings.poll_seconds):
             due = time.monotonic() - looked >= LOOK_SECONDS
             looked = time.monotonic() if due else looked
-            try:
-                if due:
-                    self._reap()
-                relay(self._database, app, self._settings, self._clock(), look_for_lost=due)
-            except BrokerError as error:  # without its traceback: there may be one a second for an hour
-                log.warning("broker_unreachable", error=str(error))
-                self._stop.wait(PAUSE_SECONDS)
-            except Exception as error:  # the thread's boundary: without it one bad moment would end all sending
-                log.exception("relay_failed", error=str(error))
+            chores = (self._reap, self._plant) if due else ()
+            send = partial(relay, self._database, app, self._settings, self._clock(), look_for_lost=due)
+            went_well = [self._try(each) for each in (*chores, send)]  # each, whatever became of the one before
+            if not all(went_well):
                 self._stop.wait(PAUSE_SECONDS)
 
+    def _try(self, step: Callable[[], object]) -> bool:
+        """Whether the step went well."""
+        try:
+            step()
+        except BrokerError as error:  # without its traceback: there may be one a second for an hour
+            log.warning("broker_unreachable", error=str(error))
+            return False
+        except Exception as error:  # the thread's boundary: without it one bad moment would end all sending
+            log.exception("relay_failed", error=str(error))
+            return False
+        return True
+
     def _reap(self) -> None:
+        reaper.reap(self._database, self._clock())
+
+    def _plant(self) -> None:
         with self._database.write() as session:
-            reaper.reap(session, self._clock())
             canary.plant(session, self._clock(), self._settings.canary_seconds / 4)

@@ -40,21 +40,32 @@ def held_out(session: Session, project: ProjectRow, count: int, now: datetime) -
     return [Candidate(*_segment(project, members, ends, int(place))) for place in chosen]
 
 
-def explorations(session: Session, project: ProjectRow, count: int) -> list[Candidate]:
-    """`count` observations of the pool and a segment's worth of actions for each, both uniform; fewer for no pool.
+@dataclass(frozen=True)
+class States:
+    """Members of the pool whose observations can be gone back to; `ends` counts their segments up to each, (M,)."""
+
+    members: Sequence[queries.Member]
+    ends: NDArray[np.int64]
+
+
+def states(session: Session, project: ProjectRow) -> States:
+    """What can be explored from. It takes a while in a large pool, and needs no lock: members stay.
 
     Where the project has a simulator only trajectories whose simulator states are kept can be gone back to.
     """
     simulated = projects.environment_of(project).simulator is not None
     members = queries.members(session, project.id, "pool", with_provenance=simulated)
-    ends = np.cumsum([member.segments for member in members])
-    if not len(ends) or not ends[-1]:
+    return States(members, np.cumsum([member.segments for member in members], dtype=np.int64))
+
+
+def explorations(project: ProjectRow, states: States, count: int) -> list[Candidate]:
+    """`count` of the states and a segment's worth of actions for each, both uniform; none where there is no state."""
+    if not len(states.ends) or not states.ends[-1]:
         return []
     rng = _generator(project)
-    places = rng.integers(0, ends[-1], count)
-    return [
-        Candidate(*_segment(project, members, ends, int(place)), actions=_actions(project, rng)) for place in places
-    ]
+    places = rng.integers(0, states.ends[-1], count)
+    segments = [_segment(project, states.members, states.ends, int(place)) for place in places]
+    return [Candidate(*segment, actions=_actions(project, rng)) for segment in segments]
 
 
 def _segment(

@@ -1,10 +1,14 @@
 """Errors of the service: one class an error, each a sentence with a status. The API turns them into problem details."""
 
 import re
+from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
 from api_schemas.errors import InvalidParam, Problem
+
+LONGEST = 200  # characters of a value that are shown
+SHOWN = 5  # steps of two labels that differ
 
 
 class ServiceError(Exception):
@@ -36,7 +40,7 @@ class UnknownResource(ServiceError):
     status_code = 404
 
     def __init__(self, noun: str, name: object) -> None:
-        super().__init__(f"there is no {noun} {str(name)[:200]!r}")
+        super().__init__(f"there is no {noun} {str(name)[:LONGEST]!r}")
 
 
 class InvalidField(ServiceError):
@@ -45,7 +49,7 @@ class InvalidField(ServiceError):
     status_code = 422
 
     def __init__(self, name: str, value: object, reason: str) -> None:
-        shown = str(value)[:200]
+        shown = str(value)[:LONGEST]
         super().__init__(f"{name}: {reason}, got {shown}", [InvalidParam(name=name, reason=reason, value=shown)])
 
 
@@ -185,8 +189,18 @@ class LabelConflict(ServiceError):
 
     status_code = 409
 
-    def __init__(self, trajectory: str, start: int, stored: object, sent: object) -> None:
-        super().__init__(f"segment {trajectory}:{start} is labeled {stored}; {sent} is different and was not stored")
+    def __init__(self, trajectory: str, start: int, stored: Sequence[object], sent: Sequence[object]) -> None:
+        apart = [step for step in range(min(len(stored), len(sent))) if _content(stored[step]) != _content(sent[step])]
+        short = max(len(str(stored)), len(str(sent))) <= LONGEST
+        first = 0 if short or not apart else apart[0]
+        part = slice(None) if short else slice(first, first + SHOWN)
+        params = [
+            InvalidParam(name=f"step {step}", reason=f"is labeled {_shown(stored[step])}", value=_shown(sent[step]))
+            for step in apart[:SHOWN]
+        ]
+        place = f"segment {trajectory}:{start}" if short else f"segment {trajectory}:{start}, from its step {first} on,"
+        differ = f"is different in {len(apart)} of {len(sent)} steps and was not stored"
+        super().__init__(f"{place} is labeled {_shown(stored[part])}; {_shown(sent[part])} {differ}", params)
 
 
 class SplitConflict(ServiceError):
@@ -263,8 +277,9 @@ class JobFinished(ServiceError):
 
     status_code = 409
 
-    def __init__(self, job: UUID, state: str) -> None:
-        super().__init__(f"job {job} is {state}; there is nothing left to cancel")
+    def __init__(self, job: UUID, state: str, successor: UUID | None = None) -> None:
+        left = f"its round goes on in job {successor}" if successor else "there is nothing left to cancel"
+        super().__init__(f"job {job} is {state}; {left}")
 
 
 class JobLost(ServiceError):
@@ -274,3 +289,16 @@ class JobLost(ServiceError):
 
     def __init__(self, job: UUID, fence: int) -> None:
         super().__init__(f"job {job}: fence {fence} is not the current one")
+
+
+def _shown(value: object) -> str:
+    """At most LONGEST characters of it."""
+    text = str(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def _content(step: object) -> str:
+    """A step's action, or the set of actions that explain it, in whatever order they are named."""
+    choices = step if isinstance(step, list) else [step]
+    discrete = all(isinstance(choice, int) for choice in choices)
+    return str(sorted(set(choices)) if discrete else choices)

@@ -26,9 +26,13 @@ def begin(session: Session, use: KeyUse, now: datetime, keep: timedelta) -> Idem
     Where the same key is in use at this moment, this waits for the other's end. Raises IdempotencyKeyReused.
     """
     row = queries.insert_or_find(session, use.caller, use.route, use.key, use.request_sha256, now, now + keep)
-    if row.request_sha256 != use.request_sha256:
-        raise IdempotencyKeyReused(use.key, use.route)
-    return row
+    return _checked(row, use)
+
+
+def find(session: Session, use: KeyUse, now: datetime) -> IdempotencyRow | None:
+    """The kept answer, where there is one already; waits for nobody. Raises IdempotencyKeyReused."""
+    row = queries.kept(session, use.caller, use.route, use.key, now)
+    return None if row is None else _checked(row, use)
 
 
 def finish(row: IdempotencyRow, status: int, location: str | None, body: str) -> None:
@@ -39,3 +43,9 @@ def finish(row: IdempotencyRow, status: int, location: str | None, body: str) ->
 def forget(session: Session, row: IdempotencyRow) -> None:
     """The request changed nothing that a repetition would do twice."""
     session.delete(row)
+
+
+def _checked(row: IdempotencyRow, use: KeyUse) -> IdempotencyRow:
+    if row.request_sha256 != use.request_sha256:
+        raise IdempotencyKeyReused(use.key, use.route)
+    return row

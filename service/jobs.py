@@ -153,15 +153,13 @@ def cancel(session: Session, job_id: UUID, now: datetime) -> JobRow:
     return row
 
 
-def reap(session: Session, now: datetime) -> list[JobRow]:
-    """Queue the jobs of silent workers again, or fail those that have used up their attempts; returns the latter."""
-    failed = []
-    for row in queries.silent(session, now):
+def reap_one(session: Session, now: datetime) -> JobRow | None:
+    """Queue the job of a silent worker again, or fail it where its attempts are used up; None where there is none."""
+    row = queries.silent(session, now)
+    if row is not None:
         error = f"worker {row.owner} fell silent in attempt {row.attempts} of {row.max_attempts}"
         _end_attempt(session, row, error, now, retry=True)
-        if row.state == "failed":
-            failed.append(row)
-    return failed
+    return row
 
 
 def worker_alive(session: Session, owner: str, queues: Sequence[str], now: datetime) -> None:

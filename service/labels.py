@@ -22,6 +22,7 @@ from api_schemas.labels import (
 from api_schemas.trajectories import SplitChoice
 from service import events, explorations, leases, pool, projects, rounds
 from service.actions import check_actions
+from service.clock import Clock
 from service.errors import (
     InvalidField,
     InvalidLabel,
@@ -80,7 +81,7 @@ class _Batch:
 
 
 def accept(
-    session: Session, request: LabelsRequest, uploads: Sequence[LabeledUpload], now: datetime, max_attempts: int = 3
+    session: Session, request: LabelsRequest, uploads: Sequence[LabeledUpload], clock: Clock, max_attempts: int = 3
 ) -> LabelsAccepted:
     """Store all labels or none, in the caller's transaction, and ask for a round when enough have come.
 
@@ -88,8 +89,9 @@ def accept(
     LeaseLost, SegmentLeased, LabelConflict, SplitConflict, BudgetExhausted.
     """
     members = _fitting(session, projects.find(session, request.project), request.items)
-    pool.keep(session, [upload.stored for upload in uploads], now)
+    pool.keep(session, [upload.stored for upload in uploads], clock())
     project = projects.find(session, request.project, lock=True)
+    now = clock()  # under the lock: while it was waited for a lease may have ended
     acquisition = _acquisition(session, project, request)
     uploaded, reserved = _take_uploads(session, project, acquisition, uploads, now)
     members |= _fitting(session, project, uploaded)
@@ -140,9 +142,8 @@ def _take_uploads(
     """The labels of uploaded trajectories, which become members first; and how many live leases had reserved them."""
     taken: list[LabelItem] = []
     reserved = 0
+    _join(session, project, uploads, now)
     for position, upload in enumerate(uploads):
-        split: SplitChoice = upload.split if upload.rank is None else "pool"
-        pool.add(session, project, upload.stored, split, now, upload.provenance_sha256)
         items = _items(project, upload)
         if upload.rank is not None:
             if not items:
@@ -152,6 +153,16 @@ def _take_uploads(
             reserved += explorations.answer(session, project, acquisition, upload.rank, name, position, now)
         taken += items
     return taken, reserved
+
+
+def _join(session: Session, project: ProjectRow, uploads: Sequence[LabeledUpload], now: datetime) -> None:
+    """The uploads become members; what answers an exploration joins the pool."""
+    by_split: dict[SplitChoice, list[tuple[StoredTrajectory, str | None]]] = {}
+    for upload in uploads:
+        split: SplitChoice = upload.split if upload.rank is None else "pool"
+        by_split.setdefault(split, []).append((upload.stored, upload.provenance_sha256))
+    for split, stored in by_split.items():
+        pool.add_all(session, project, stored, split, now)
 
 
 def _fitting(session: Session, project: ProjectRow, items: Sequence[LabelItem]) -> dict[str, Membership]:

@@ -6,8 +6,10 @@ from uuid import UUID
 from sqlalchemy.orm import Session
 
 from service import events, projects
+from service.clock import Clock
 from service.errors import BudgetExhausted, InvalidLeaseToken, LeaseLost, UnknownResource
 from service.store.queries import acquisitions as queries
+from service.store.queries import pool as pool_queries
 from service.store.queries import rows
 from service.store.tables import AcquisitionRow, ProjectRow
 
@@ -23,13 +25,13 @@ def find(session: Session, acquisition_id: UUID) -> AcquisitionRow:
     return row
 
 
-def extend(session: Session, acquisition_id: UUID, token: int, seconds: float | None, now: datetime) -> AcquisitionRow:
+def extend(session: Session, acquisition_id: UUID, token: int, seconds: float | None, clock: Clock) -> AcquisitionRow:
     """Move the lease's end. What another has claimed meanwhile stays theirs.
 
     A lease that has expired reserved nothing meanwhile, so it needs room in the budget again.
     Raises InvalidLeaseToken, LeaseLost, BudgetExhausted.
     """
-    row, project = _held(session, acquisition_id, token)
+    row, project, now = _held(session, acquisition_id, token, clock)
     held = queries.claims_of(session, row.id, token)
     if not held:
         raise LeaseLost(row.id, "its segments are labeled or held by others by now")
@@ -43,9 +45,9 @@ def extend(session: Session, acquisition_id: UUID, token: int, seconds: float | 
     return row
 
 
-def release(session: Session, acquisition_id: UUID, token: int, now: datetime) -> AcquisitionRow:
+def release(session: Session, acquisition_id: UUID, token: int, clock: Clock) -> AcquisitionRow:
     """Give the unlabeled segments back to the pool. Raises InvalidLeaseToken, LeaseLost."""
-    row, _ = _held(session, acquisition_id, token)
+    row, _, now = _held(session, acquisition_id, token, clock)
     held = queries.claims_of(session, row.id, token)
     for claim in held:
         session.delete(claim)
@@ -77,7 +79,7 @@ def check_budget(session: Session, project: ProjectRow, added: int, now: datetim
     if total is None:
         return
     session.flush()
-    used = project.pool_labels + queries.reserved(session, project.id, now)
+    used = project.pool_labels + pool_queries.leased(session, project.id, now).reserved
     if used > total:
         raise BudgetExhausted(added, max(0, total - (used - added)), total)
 
@@ -87,8 +89,12 @@ def exploration_name(acquisition_id: UUID) -> str:
     return f"explore:{acquisition_id.hex}"
 
 
-def _held(session: Session, acquisition_id: UUID, token: int) -> tuple[AcquisitionRow, ProjectRow]:
-    """The acquisition, locked after its project, too: the sweep of expired leases locks nothing else.
+def _held(
+    session: Session, acquisition_id: UUID, token: int, clock: Clock
+) -> tuple[AcquisitionRow, ProjectRow, datetime]:
+    """The acquisition, its project, and what time it is now that both are locked: waiting for a lock takes time.
+
+    The acquisition is locked too, after the project: the sweep of expired leases locks nothing else.
 
     Raises UnknownResource, InvalidLeaseToken, LeaseLost.
     """
@@ -100,4 +106,4 @@ def _held(session: Session, acquisition_id: UUID, token: int) -> tuple[Acquisiti
         raise InvalidLeaseToken(row.id, token)
     if row.status not in OPEN:
         raise LeaseLost(row.id, f"it is {row.status}")
-    return row, project
+    return row, project, clock()

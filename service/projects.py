@@ -11,10 +11,10 @@ from api_schemas.environments import Environment, Spaces
 from api_schemas.projects import Budget, LabelingPolicy, PoolCounts, Project, ProjectCreate, ProjectPatch
 from service import events
 from service.errors import NameTaken, UnknownResource
-from service.store.queries import acquisitions as acquisition_queries
 from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
 from service.store.queries import rows
+from service.store.queries.pool import Leased
 from service.store.tables import ProjectRow
 
 
@@ -91,25 +91,24 @@ class SplitCount:
         return self.segments - self.leased - self.labeled
 
 
-def split_count(session: Session, row: ProjectRow, split: str, now: datetime) -> SplitCount:
-    """Counts of one split at `now`, from the project's counters; only live leases are counted."""
-    leased = pool_queries.leased(session, row.id, split, now)
+def split_count(row: ProjectRow, split: str, leased: Leased) -> SplitCount:
+    """Counts of one split, from the project's counters and what is under a live lease."""
     if split == "pool":
-        return SplitCount(row.pool_trajectories, row.pool_segments, leased, row.pool_labels)
-    return SplitCount(row.held_out_trajectories, row.held_out_segments, leased, row.held_out_labels)
+        return SplitCount(row.pool_trajectories, row.pool_segments, leased.pool, row.pool_labels)
+    return SplitCount(row.held_out_trajectories, row.held_out_segments, leased.held_out, row.held_out_labels)
 
 
-def budget_of(session: Session, row: ProjectRow, now: datetime) -> Budget:
+def budget_of(row: ProjectRow, leased: Leased) -> Budget:
     """Labels spent on the pool, and reserved by live leases, against the budget."""
     total = policy_of(row).label_budget
-    reserved = acquisition_queries.reserved(session, row.id, now)
-    remaining = None if total is None else max(0, total - row.pool_labels - reserved)
-    return Budget(total=total, spent=row.pool_labels, reserved=reserved, remaining=remaining)
+    remaining = None if total is None else max(0, total - row.pool_labels - leased.reserved)
+    return Budget(total=total, spent=row.pool_labels, reserved=leased.reserved, remaining=remaining)
 
 
 def describe(session: Session, row: ProjectRow, now: datetime) -> Project:
     """The project as the API shows it."""
-    pool, held_out = split_count(session, row, "pool", now), split_count(session, row, "held_out", now)
+    leased = pool_queries.leased(session, row.id, now)
+    pool, held_out = split_count(row, "pool", leased), split_count(row, "held_out", leased)
     current = round_queries.current_round(session, row.id)
     counts = PoolCounts(
         pool_trajectories=pool.trajectories,
@@ -132,7 +131,7 @@ def describe(session: Session, row: ProjectRow, now: datetime) -> Project:
         seed=row.seed,
         policy=policy_of(row),
         counts=counts,
-        budget=budget_of(session, row, now),
+        budget=budget_of(row, leased),
         label_watermark=row.label_watermark,
         current_round=current.id if current else None,
         created_at=row.created_at,

@@ -5,6 +5,7 @@ from datetime import datetime, timedelta
 from sqlalchemy.orm import Session
 
 from service import jobs, leases, origin, rounds, scorings
+from service.store.database import Database
 from service.store.queries import idempotency as idempotency_queries
 from service.store.queries import jobs as job_queries
 from service.store.tables import JobRow
@@ -12,15 +13,19 @@ from service.store.tables import JobRow
 WORKER_MEMORY = timedelta(hours=1)
 
 
-def reap(session: Session, now: datetime) -> None:
-    """Queue the jobs of silent workers again; what has used up its attempts fails with all that waits for it."""
+def reap(database: Database, now: datetime) -> None:
+    """Queue the jobs of silent workers again; what has used up its attempts fails with all that waits for it.
+
+    A transaction each: whoever holds one job or project and waits for the next may be waited for.
+    """
     with origin.bound(actor="reaper"):
-        for row in jobs.reap(session, now):
-            with origin.bound(correlation=row.correlation):
-                give_up(session, row, now)
-        leases.note_expired(session, now)
-        job_queries.forget_workers(session, now - WORKER_MEMORY)
-        idempotency_queries.forget_expired(session, now)
+        while _reap_one(database, now):
+            pass
+        with database.write() as session:
+            leases.note_expired(session, now)
+        with database.write() as session:
+            job_queries.forget_workers(session, now - WORKER_MEMORY)
+            idempotency_queries.forget_expired(session, now)
 
 
 def give_up(session: Session, row: JobRow, now: datetime) -> None:
@@ -33,3 +38,12 @@ def give_up(session: Session, row: JobRow, now: datetime) -> None:
         round_id = scorings.find(session, row.subject_id).round_id
         if round_id is not None:
             rounds.fail(session, round_id, error, now)
+
+
+def _reap_one(database: Database, now: datetime) -> bool:
+    with database.write() as session:
+        row = jobs.reap_one(session, now)
+        if row is not None and row.state == "failed":
+            with origin.bound(correlation=row.correlation):
+                give_up(session, row, now)
+    return row is not None

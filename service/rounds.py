@@ -1,5 +1,6 @@
 """Rounds: one retraining on all labels up to a watermark, whose stages are stored as they are done."""
 
+from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
@@ -10,7 +11,7 @@ from api_schemas.rounds import ModelError, ModelErrorCurve, ModelErrorPoint, Rou
 from service import events, jobs, projects
 from service.errors import NoModelFamily, NothingToLearn, UnknownResource
 from service.store.queries import jobs as job_queries
-from service.store.queries import labels as label_queries
+from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as queries
 from service.store.queries import rows
 from service.store.tables import ModelVersionRow, ProjectRow, RoundRow
@@ -23,7 +24,7 @@ def request(session: Session, project: ProjectRow, now: datetime, max_attempts: 
     """
     if project.family is None:
         raise NoModelFamily(project.id)
-    labels = label_queries.label_count(session, project.id, "pool", project.label_watermark)
+    labels = project.pool_labels
     if labels == 0:
         raise NothingToLearn(project.id)
     waiting = queries.queued_rounds(session, project.id)
@@ -119,11 +120,13 @@ def fail(session: Session, round_id: UUID, error: str, now: datetime) -> None:
     events.record(session, row.project_id, "round.failed", {"round": str(row.id), "error": error}, now)
 
 
-def cancel(session: Session, round_id: UUID, now: datetime) -> None:
-    """Somebody stopped the round; its labels are not due again. A round that is in use or has ended stays as it is."""
+def cancel(
+    session: Session, round_id: UUID, now: datetime, while_in: Sequence[str] = ("queued", "training", "scoring")
+) -> None:
+    """Somebody stopped the round; its labels are not due again. In any other status it stays as it is."""
     projects.find(session, find(session, round_id).project_id, lock=True)
     row = find(session, round_id, lock=True)
-    if row.status not in ("queued", "training", "scoring"):
+    if row.status not in while_in:
         return
     row.status, row.finished_at = "cancelled", now
     events.record(session, row.project_id, "round.cancelled", {"round": str(row.id), "number": row.number}, now)
@@ -183,7 +186,8 @@ def _request_subgoal_generator(session: Session, project: ProjectRow, now: datet
     if newest is not None and project.pool_trajectories < 2 * newest.watermark:
         return
     if job_queries.unfinished(session, project.id, "train_subgoal_generator") is None:
-        payload = TrainSubgoalGenerator(project=project.id)
+        newest_member = pool_queries.newest_membership(session, project.id, "pool")
+        payload = TrainSubgoalGenerator(project=project.id, memberships=newest_member)
         jobs.enqueue(session, project.id, payload, project.id, now, max_attempts)
 
 

@@ -76,14 +76,14 @@ def start(
     session: Session, project: ProjectRow, strategy: str, round_row: RoundRow | None, now: datetime, limits: Limits
 ) -> ScoringRow:
     """Cut the pool into shards and queue one job for each."""
-    members = pool_queries.memberships(session, project.id, "pool")
-    cuts = _cut([(member.id, member.segments) for member in members], limits.shard_segments)
+    members = pool_queries.sizes(session, project.id, "pool")
+    cuts = _cut(members, limits.shard_segments)
     scoring = ScoringRow(
         project_id=project.id,
         round_id=round_row.id if round_row else None,
         strategy=strategy,
         status="scoring",
-        memberships=members[-1].id if members else 0,
+        memberships=members[-1][0] if members else 0,
         shards=len(cuts),
         created_at=now,
     )

@@ -5,6 +5,8 @@ from pathlib import Path
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+POOL_SIZE = 48  # more than the 40 threads that handle requests
+
 
 class Settings(BaseSettings):
     """Where things are kept and how long a worker may be silent.
@@ -26,6 +28,7 @@ class Settings(BaseSettings):
     job_lease_seconds: float = Field(default=15.0, gt=0)
     job_max_attempts: int = Field(default=3, ge=1)
     checkpoint_seconds: float = Field(default=10.0, gt=0, description="a stage of training is kept this often")
+    silence_seconds: float = Field(default=600.0, gt=0, description="a job that says nothing for this long is hung")
     canary_seconds: float = Field(default=60.0, gt=0, description="ready while a canary of each queue is this young")
     resend_seconds: float = Field(default=15.0, gt=0, description="a sent job that nobody claimed may be sent again")
     visibility_seconds: float = Field(default=900.0, gt=0, description="after it, Redis returns a lost message")
@@ -34,6 +37,9 @@ class Settings(BaseSettings):
     queue_length: int = Field(default=2000, ge=1, description="ranked segments kept ready in the database")
     shard_transitions: int = Field(default=100_000, ge=1)
     torch_threads: int = Field(default=1, ge=1)
+    pool_size: int = Field(
+        default=POOL_SIZE, ge=1, description="connections to the database that the API holds at most"
+    )
     allowed_hosts: tuple[str, ...] = ("127.0.0.1", "localhost", "[::1]")
     max_body_bytes: int = Field(default=256 * 2**20, ge=1)
     max_labels_bytes: int = Field(default=64 * 2**20, ge=1)

@@ -175,6 +175,7 @@ def _store(
     for episode, starts in batch:
         trajectory = pool.store(job.worker.blobs, spaces, episode.observations, f"episode {episode.seed}")
         stored.append((trajectory, _store_provenance(provenance, project, asked, episode), episode, starts))
+        job.go_on()
     request = LabelsRequest(project=project.id, source=LabelSource(kind="simulator", name=asked.behavior))
     with job.transaction() as session:
         pool.keep(session, [trajectory for trajectory, *_ in stored], job.now())
@@ -186,7 +187,7 @@ def _store(
             if starts
         ]
         if uploads:
-            labels.accept(session, request, uploads, job.now(), job.worker.settings.job_max_attempts)
+            labels.accept(session, request, uploads, job.now, job.worker.settings.job_max_attempts)
 
 
 def _store_provenance(

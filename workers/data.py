@@ -1,6 +1,6 @@
 """From rows and blobs to segment batches. Observations and labels only: nothing here can open a simulator state."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +22,7 @@ from service.store.queries import labels as label_queries
 from service.store.queries import pool as pool_queries
 from service.store.tables import LabelRow, MembershipRow, ProjectRow
 
+AfterEach = Callable[[], None]  # called after each trajectory is read; may raise to stop
 CHUNK_SEGMENTS = 2048  # segments decoded at a time: bounds memory whatever the size of the pool
 
 
@@ -56,7 +57,7 @@ def windows_of(
     return windows
 
 
-def load(blobs: Blobs, windows: Sequence[Windows], length: int) -> SegmentBatch:
+def load(blobs: Blobs, windows: Sequence[Windows], length: int, after_each: AfterEach = lambda: None) -> SegmentBatch:
     """All windows as one batch of segments of `length` transitions, in order."""
     parts: dict[str, list[NDArray[Any]]] = {}
     segments: list[Segment] = []
@@ -67,11 +68,14 @@ def load(blobs: Blobs, windows: Sequence[Windows], length: int) -> SegmentBatch:
         for name, array in arrays.items():
             parts.setdefault(name, []).append(array[index])  # (T+1, ...) -> (S, L+1, ...)
         segments.extend(Segment(window.trajectory, start) for start in window.starts)
+        after_each()
     observations = {name: torch.from_numpy(np.concatenate(arrays)) for name, arrays in parts.items()}
     return SegmentBatch(observations, segments=tuple(segments))
 
 
-def chunks(blobs: Blobs, windows: Sequence[Windows], length: int) -> Iterator[SegmentBatch]:
+def chunks(
+    blobs: Blobs, windows: Sequence[Windows], length: int, after_each: AfterEach = lambda: None
+) -> Iterator[SegmentBatch]:
     """The same segments in batches of about CHUNK_SEGMENTS, whole trajectories each, one read ahead of its use.
 
     Reading waits for disk or network most of the time, so the next batch is read while this one is scored.
@@ -80,7 +84,7 @@ def chunks(blobs: Blobs, windows: Sequence[Windows], length: int) -> Iterator[Se
     with ThreadPoolExecutor(1, "read-ahead") as reader:
         ahead = None
         for group in groups:
-            ready, ahead = ahead, reader.submit(load, blobs, group, length)
+            ready, ahead = ahead, reader.submit(load, blobs, group, length, after_each)
             if ready is not None:
                 yield ready.result()
         if ahead is not None:
@@ -103,7 +107,12 @@ def _groups(windows: Sequence[Windows]) -> Iterator[list[Windows]]:
 
 
 def labeled_batch(
-    database: Database, blobs: Blobs, project: ProjectRow, split: str, watermark: int
+    database: Database,
+    blobs: Blobs,
+    project: ProjectRow,
+    split: str,
+    watermark: int,
+    after_each: AfterEach = lambda: None,
 ) -> SegmentBatch | None:
     """All labeled segments of a split up to a watermark, in the order of acceptance; None where there are none."""
     with database.read() as session:  # ended before the first blob is read: a database ends those that sit idle
@@ -112,7 +121,7 @@ def labeled_batch(
     if not rows:
         return None
     windows = [Windows(row.trajectory_id, contents[row.trajectory_id].blob_sha256, (row.start,)) for row in rows]
-    batch = load_in_order(blobs, windows, project.segment_length)
+    batch = load_in_order(blobs, windows, project.segment_length, after_each)
     action = projects.spaces_of(project).actions
     if not isinstance(action, DiscreteActions):
         actions = torch.tensor([row.actions for row in rows], dtype=torch.float32)  # (B, L, D)
@@ -121,7 +130,9 @@ def labeled_batch(
     return SegmentBatch(batch.observations, actions, _sets(rows, action.n), batch.segments)
 
 
-def load_in_order(blobs: Blobs, windows: Sequence[Windows], length: int) -> SegmentBatch:
+def load_in_order(
+    blobs: Blobs, windows: Sequence[Windows], length: int, after_each: AfterEach = lambda: None
+) -> SegmentBatch:
     """Each trajectory is opened once, and the segments come back in the order in which they were asked for."""
     places: dict[str, list[int]] = {}
     for place, window in enumerate(windows):
@@ -130,7 +141,7 @@ def load_in_order(blobs: Blobs, windows: Sequence[Windows], length: int) -> Segm
         Windows(name, windows[of[0]].blob_sha256, tuple(windows[place].starts[0] for place in of))
         for name, of in places.items()
     ]
-    batch = concatenate([load(blobs, [window], length) for window in grouped])
+    batch = concatenate([load(blobs, [window], length, after_each) for window in grouped])
     order = [place for of in places.values() for place in of]
     return batch.take(torch.from_numpy(np.argsort(order)))
 

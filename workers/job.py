@@ -1,6 +1,7 @@
 """A job while it runs: its lease, its transactions, its heartbeat."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -46,6 +47,8 @@ class RunningJob:
         self.worker, self.lease = worker, lease
         self._progress, self._message = 0.0, ""
         self._lost = threading.Event()
+        self._began = self._heard = time.monotonic()
+        self._told_of_silence = False
 
     @contextmanager
     def transaction(self) -> Iterator[Session]:
@@ -53,6 +56,7 @@ class RunningJob:
         with self.worker.database.write() as session:
             jobs.held(session, self.lease)
             yield session
+        self._heard = time.monotonic()
 
     def now(self) -> datetime:
         """The worker's clock."""
@@ -61,20 +65,40 @@ class RunningJob:
     def report(self, progress: float, message: str) -> None:
         """Say how far the job is; the heartbeat writes it. Raises JobLost, and GaveWay when the process ends."""
         self._progress, self._message = progress, message
+        self.go_on()
+
+    def go_on(self) -> None:
+        """Say that the job is at work still, where there is no more to report; from any thread.
+
+        A job that neither reports nor says this for `silence_seconds` counts as hung: call it once for each blob, chunk
+        or slice, whatever one of them may take. Raises JobLost, and GaveWay when the process ends.
+        """
+        self._heard = time.monotonic()
         if self._lost.is_set():
             raise JobLost(self.lease.job_id, self.lease.fence)
         if self.worker.stopping.is_set():
             raise GaveWay(f"worker {self.worker.owner} stops")
 
     def should_give_way(self) -> bool:
-        """True where the process ends or a job of higher priority waits for this worker."""
+        """True where the process ends or a job of higher priority waits for this worker.
+
+        An attempt works for as long as a checkpoint takes before it gives way to others: however many of them keep
+        coming, each attempt brings the job further.
+        """
         if self.worker.stopping.is_set():
             return True
+        if time.monotonic() - self._began < self.worker.settings.checkpoint_seconds:
+            return False
         with self.worker.database.read() as session:
             return queries.higher_waiting(session, self.worker.queues, self.lease.priority, self.now())
 
     def beat(self) -> None:
-        """Renew the lease once, and say that this worker is there: a Celery child has nobody else to say it."""
+        """Renew the lease once, and say that this worker is there: a Celery child has nobody else to say it.
+
+        A job that hangs is not renewed: its lease ends, and the reaper gives it to another.
+        """
+        if self._hangs():
+            return
         worker, seconds = self.worker, self.worker.settings.job_lease_seconds
         try:
             with worker.database.write() as session:
@@ -84,6 +108,16 @@ class RunningJob:
             self._lost.set()
         except SQLAlchemyError as error:  # the next beat tries again; the lease outlasts a few of them
             log.warning("heartbeat_failed", job=str(self.lease.job_id), error=str(error))
+
+    def _hangs(self) -> bool:
+        silence = time.monotonic() - self._heard
+        if silence < self.worker.settings.silence_seconds:
+            self._told_of_silence = False
+            return False
+        if not self._told_of_silence:
+            log.warning("job_hangs", job=str(self.lease.job_id), silent_for=round(silence), last=self._message)
+        self._told_of_silence = True
+        return True
 
 
 class Heartbeat:

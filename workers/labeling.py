@@ -5,7 +5,7 @@ observed next; or, to explore, executes there the actions that it is told. No st
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from datetime import UTC, datetime
 from typing import Any
 
@@ -14,26 +14,41 @@ from numpy.typing import NDArray
 
 from api_schemas.acquisitions import Acquisition, AcquisitionItem
 from api_schemas.labels import Action, LabeledTrajectory, LabelItem, LabelsAccepted, LabelSource
+from api_schemas.projects import Project
 from asim.arrays import pack
 from asim.client import Client
-from asim.errors import LeaseLost, ServiceError, Unavailable
+from asim.errors import ServiceError, Unavailable
 from workers.delivery import Answer, Delivery
 from workers.explanation import explain
+from workers.lease import Clock, Lease, lost
 from workers.simulators.base import Observation, Simulator, State
 from workers.simulators.catalog import make_simulator
 
-LONGEST_LEASE = 30 * 86400.0  # seconds that the service gives at once
 Progress = Callable[[int, int], None]
-Clock = Callable[[], datetime]
+NOTES = 10  # of what was refused, told besides the first
 
 
-class UnexplainedStep(ValueError):
+class UnanswerableItem(ValueError):
+    """The simulator has no answer to an item."""
+
+
+class UnexplainedStep(UnanswerableItem):
     """No action of the simulator leads from a segment's state to its next observation."""
 
     def __init__(self, item: AcquisitionItem, step: int, residual: float) -> None:
         super().__init__(
             f"segment {item.trajectory}:{item.start}, step {step}: no action reproduces the observation; "
             f"the nearest one is off by {residual:g}"
+        )
+
+
+class EndedEarly(UnanswerableItem):
+    """An exploration's episode ended before it was a segment long."""
+
+    def __init__(self, item: AcquisitionItem, executed: int, needed: int) -> None:
+        super().__init__(
+            f"item {item.rank}, explored from {item.trajectory}:{item.start}: the episode ended after {executed} "
+            f"transitions, a segment of this project needs {needed}"
         )
 
 
@@ -48,7 +63,8 @@ def run_labeling(
 
     generator: where several actions explain a step, draws the one that the label names beside the whole set.
     Where an item cannot be labeled, or its answer is refused, the others are posted all the same and it is given back
-    before the error is raised. Raises UnexplainedStep and the client's errors, LeaseLost among them.
+    before the error is raised. Raises UnanswerableItem and the client's errors, LeaseLost among them;
+    where several items were refused, that of the first, which bears the others as notes.
     """
     project = client.project(acquisition.project)
     environment = project.environment
@@ -57,80 +73,46 @@ def run_labeling(
     if not acquisition.items:
         raise ValueError(f"acquisition {acquisition.id} holds no items")
     lease, answers = Lease(client, acquisition, clock), list[Answer]()
-    refused: list[UnexplainedStep | ServiceError] = []
+    refused: list[UnanswerableItem | ServiceError] = []
     with closing(make_simulator(environment.simulator, environment.options)) as simulator:
         for done, item in enumerate(acquisition.items, 1):
             lease.keep()
             try:
-                answers.append(_answer(client, acquisition, simulator, item, generator))
+                answers.append(_answer(client, project, acquisition, simulator, item, generator))
             except Unavailable:
                 raise  # that is not the item's fault: all of them can be answered later
-            except (UnexplainedStep, ServiceError) as error:
+            except (UnanswerableItem, ServiceError) as error:
                 refused.append(error)
             if progress is not None:
                 progress(done, len(acquisition.items))
         source = LabelSource(kind="simulator", name=type(simulator).__name__)
-    delivery = Delivery(client, acquisition, source)
+    delivery = Delivery(client, acquisition, source, lease.holds)
     delivery.hand_in(answers)
     refused += delivery.refused
     if refused:
         lease.give_back()
-        raise _lost(refused, len(acquisition.items)) or refused[0]
+        raise lost(refused, len(acquisition.items)) or _first(refused)
     return delivery.receipt()
 
 
-class Lease:
-    """Keeps the lease of a batch that takes long to label: once half of what is left has passed, it is extended.
-
-    clock: the time of day, which may differ from the service's by less than the lease.
-    """
-
-    def __init__(self, client: Client, acquisition: Acquisition, clock: Clock) -> None:
-        self._client, self._acquisition, self._clock = client, acquisition, clock
-        taken = acquisition.lease_expires_at - acquisition.created_at
-        self._seconds = min(taken.total_seconds(), LONGEST_LEASE)  # as its taker wanted it, not the project's default
-        self._half = self._half_way(acquisition)
-
-    def keep(self) -> None:
-        """Extend the lease where it is time to. Raises LeaseLost where nothing is left to answer under it."""
-        token = self._acquisition.token
-        if token is None or self._clock() < self._half:
-            return
-        try:
-            self._half = self._half_way(self._client.extend(self._acquisition.id, token, self._seconds))
-        except LeaseLost as error:
-            if self._client.acquisition(self._acquisition.id).status != "labeled":  # else all is a duplicate, no loss
-                raise _lost([error], len(self._acquisition.items)) or error from error
-
-    def give_back(self) -> None:
-        """Release what is not answered."""
-        if self._acquisition.token is not None:
-            with suppress(LeaseLost):  # there is nothing left that could be given back
-                self._client.release(self._acquisition.id, self._acquisition.token)
-
-    def _half_way(self, acquisition: Acquisition) -> datetime:
-        now = self._clock()
-        return now + (acquisition.lease_expires_at - now) / 2
-
-
-def _lost(refused: Sequence[Exception], count: int) -> LeaseLost | None:
-    """The lease's loss in a sentence, where that is why answers were refused."""
-    lost = [error.problem for error in refused if isinstance(error, LeaseLost)]
-    if not lost:
-        return None
-    detail = f"the lease was lost while its {count} items were answered: {lost[0].detail}"
-    return LeaseLost(lost[0].model_copy(update={"detail": detail}))
+def _first(refused: Sequence[Exception]) -> Exception:
+    for other in refused[1:NOTES]:
+        refused[0].add_note(f"and {other}")
+    if len(refused) > NOTES:
+        refused[0].add_note(f"and {len(refused) - NOTES} more")
+    return refused[0]
 
 
 def _answer(
     client: Client,
+    project: Project,
     acquisition: Acquisition,
     simulator: Simulator,
     item: AcquisitionItem,
     generator: np.random.Generator,
 ) -> Answer:
     if item.actions is not None:
-        return _explore(client, acquisition, simulator, item, item.actions)
+        return _explore(client, project, simulator, item, item.actions)
     return _label(client, acquisition, simulator, item, generator)
 
 
@@ -157,10 +139,10 @@ def _label(
 
 
 def _explore(
-    client: Client, acquisition: Acquisition, simulator: Simulator, item: AcquisitionItem, actions: Sequence[Action]
+    client: Client, project: Project, simulator: Simulator, item: AcquisitionItem, actions: Sequence[Action]
 ) -> LabeledTrajectory:
     """What is observed when the actions are executed from the item's observation on, up to the episode's end."""
-    states, _ = client.provenance(acquisition.project, item.trajectory, item.start, 1)
+    states, _ = client.provenance(project.id, item.trajectory, item.start, 1)
     simulator.restore({name: array[0] for name, array in states.items()})
     before, seen = list[State](), [simulator.observe()]
     for action in actions:
@@ -170,6 +152,8 @@ def _explore(
         if step.terminated or step.truncated:
             break
     executed = list(actions[: len(before)])
+    if len(executed) < project.segment_length:  # the service would refuse it, and with it the request that it is in
+        raise EndedEarly(item, len(executed), project.segment_length)
     sets = []
     for number, (state, observed, action) in enumerate(zip(before, seen[1:], executed, strict=True)):
         explaining, residual = explain(simulator, state, observed)

@@ -12,7 +12,7 @@ import threading
 import time
 from types import FrameType
 
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import SQLAlchemyError
 
 from service import canary, jobs, reaper
 from service.clock import utc_now
@@ -32,18 +32,26 @@ def run(worker: Worker) -> None:
     threading.Thread(target=_say_alive, args=(worker,), name="alive", daemon=True).start()
     reaped = 0.0
     while not worker.stopping.is_set():
+        if time.monotonic() - reaped > REAP_SECONDS:
+            _reap(worker)
+            reaped = time.monotonic()
         try:
-            if time.monotonic() - reaped > REAP_SECONDS:
-                with worker.database.write() as session:
-                    reaper.reap(session, worker.clock())
-                    canary.plant(session, worker.clock(), worker.settings.canary_seconds / 4)
-                reaped = time.monotonic()
             if not run_next(worker):
                 worker.stopping.wait(worker.settings.poll_seconds)
-        except OperationalError as error:  # a busy or restarting database; the job's lease brings it back
+        except SQLAlchemyError as error:  # a busy or restarting database; the job's lease brings it back
             log.warning("database_unreachable", error=str(error))
             worker.stopping.wait(1.0)
     worker.database.close()
+
+
+def _reap(worker: Worker) -> None:
+    """What fails here is tried again in a second, and keeps no job from being claimed."""
+    try:
+        reaper.reap(worker.database, worker.clock())
+        with worker.database.write() as session:
+            canary.plant(session, worker.clock(), worker.settings.canary_seconds / 4)
+    except SQLAlchemyError as error:
+        log.warning("reaping_failed", error=str(error))
 
 
 def prepare_science(settings: Settings) -> None:
@@ -85,7 +93,7 @@ def _say_alive(worker: Worker) -> None:
         try:
             with worker.database.write() as session:
                 jobs.worker_alive(session, worker.owner, worker.queues, worker.clock())
-        except OperationalError as error:
+        except SQLAlchemyError as error:
             log.warning("database_unreachable", error=str(error))
         if worker.stopping.wait(ALIVE_SECONDS):
             return

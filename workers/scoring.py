@@ -1,7 +1,7 @@
 """Scoring: shards of the pool are scored apart, merged once, and ordered into the queue that acquire gives from."""
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from uuid import UUID
 
@@ -19,6 +19,7 @@ from models.acquisition.diversification import diversify, features
 from service import projects, rounds, scorings
 from service.scorings import Ranked
 from service.store.blobs import Blobs
+from service.store.database import Database
 from service.store.queries import acquisitions as queries
 from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
@@ -71,7 +72,7 @@ def run_selection(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, o
         shas = [shard.blob_sha256 for shard in queries.shards(session, scoring.id)]
         taken = pool_queries.taken_starts(session, project.id, "pool", job.now())
         members = {row.id: row for row in pool_queries.memberships(session, project.id, "pool")}
-    pool = _unpack(job.worker.blobs, [sha for sha in shas if sha is not None])
+    pool = _unpack(job.worker.blobs, [sha for sha in shas if sha is not None], job.go_on)
     candidates = _candidates(pool, members, taken, length)
     job.report(0.3, f"selecting from {len(candidates)} candidates")
     order = _order(job, project, scoring, pool, candidates, members)
@@ -83,12 +84,15 @@ def run_selection(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, o
         published = scorings.publish(session, scoring.id, ranked, job.now())
         if published.round_id is not None:
             rounds.make_current(session, published.round_id, job.now())
+    with job.worker.database.write() as session:
+        queries.note_sizes(session)
     return {"queued": len(ranked), "pool": len(pool.scores)}
 
 
-def load_models(session: Session, blobs: Blobs, project: ProjectRow, round_id: UUID | None) -> Models:
-    """The networks that a round has trained so far."""
-    rows = round_queries.models_of(session, round_id) if round_id else []
+def load_models(database: Database, blobs: Blobs, project: ProjectRow, round_id: UUID | None) -> Models:
+    """The networks that a round has trained so far. Call it outside of any transaction: the store may take minutes."""
+    with database.read() as session:
+        rows = round_queries.models_of(session, round_id) if round_id else []
     networks = [(row.kind, load_network(blobs, row, project)) for row in rows]
     single = {kind: network for kind, network in networks if kind != "ensemble"}
     ensemble = tuple(network for kind, network in networks if kind == "ensemble")
@@ -102,11 +106,10 @@ def _scores(
     windows: Sequence[data.Windows],
     generator: torch.Generator,
 ) -> NDArray[np.float32]:
-    with job.worker.database.read() as session:
-        models = load_models(session, job.worker.blobs, project, scoring.round_id)
+    models = load_models(job.worker.database, job.worker.blobs, project, scoring.round_id)
     total = sum(len(window.starts) for window in windows)
     parts: list[torch.Tensor] = []
-    for batch in data.chunks(job.worker.blobs, windows, project.segment_length):
+    for batch in data.chunks(job.worker.blobs, windows, project.segment_length, job.go_on):
         parts.append(score_pool(STRATEGIES[scoring.strategy], models, batch, generator))
         done = sum(len(part) for part in parts)
         job.report(done / total, f"scored {done} of {total} segments with {scoring.strategy}")
@@ -125,10 +128,11 @@ def _order(
     if not scorings.NEEDS[scoring.strategy] or not projects.policy_of(project).diversify or not len(candidates):
         return np.arange(len(candidates))
     with job.worker.database.read() as session:
-        models = load_models(session, job.worker.blobs, project, scoring.round_id)
         windows = _candidate_windows(session, project, pool, candidates, members)
         generator = _generator(session, project, scoring, f"selection {scoring.selections}")
-    batch = data.load_in_order(job.worker.blobs, windows, project.segment_length)
+    models = load_models(job.worker.database, job.worker.blobs, project, scoring.round_id)
+    batch = data.load_in_order(job.worker.blobs, windows, project.segment_length, job.go_on)
+    job.report(0.6, f"diversifying {len(candidates)} candidates")
     described = features(_needed(models, scoring.strategy), batch)
     scores = torch.from_numpy(pool.scores[candidates])
     order: NDArray[np.int64] = diversify(scores, described, len(candidates), generator).numpy()
@@ -173,8 +177,11 @@ def _pack(project: ProjectRow, members: Sequence[MembershipRow], scores: NDArray
     return save_arrays({"scores": scores, "members": ids, "counts": counts, "stride": np.array([project.stride])})
 
 
-def _unpack(blobs: Blobs, shas: Sequence[str]) -> PoolScores:
-    shards = [load_arrays(blobs.get("scores", sha)) for sha in shas]
+def _unpack(blobs: Blobs, shas: Sequence[str], after_each: Callable[[], None] = lambda: None) -> PoolScores:
+    shards = []
+    for sha in shas:
+        shards.append(load_arrays(blobs.get("scores", sha)))
+        after_each()
     if not shards:
         return PoolScores(np.empty(0, np.float32), np.empty(0, np.int64), np.empty(0, np.int64))
     starts = [np.concatenate([np.arange(n) * int(s["stride"][0]) for n in s["counts"]]) for s in shards]

@@ -38,7 +38,7 @@ class Stage:
 
         The weights are those of one uninterrupted run, however it is cut. `tell` may raise to stop it.
         """
-        state = self._resumed(config) or begin(network, config, generator)
+        state = self._resumed(network, batch, config) or begin(network, config, generator)
         steps, loss, saved = FIRST_STEPS, [0.0], time.monotonic()
         self._stored = state.step
         while state.step < config.steps:
@@ -74,8 +74,8 @@ class Stage:
         if state.step < state.config.steps and self._job.should_give_way():
             raise GaveWay(f"other work waits at step {state.step} of {state.config.steps} of {self._name}")
 
-    def _resumed(self, config: TrainingConfig) -> TrainingState | None:
-        """The state that an earlier attempt left, if it is whole and of this schedule."""
+    def _resumed(self, network: Network, batch: SegmentBatch, config: TrainingConfig) -> TrainingState | None:
+        """The state that an earlier attempt left, if it is whole and of this schedule, network and data."""
         with self._job.worker.database.read() as session:
             row = session.get_one(JobRow, self._job.lease.job_id)
         if row.checkpoint_sha256 is None or row.checkpoint_stage != self._name:
@@ -85,8 +85,9 @@ class Stage:
         except (MissingBlob, CorruptBlob, ValueError) as error:  # a store that is away for now is another attempt's
             log.warning("checkpoint_unusable", stage=self._name, error=str(error))
             return None
-        if state.config != config:
-            log.warning("checkpoint_of_another_schedule", stage=self._name, found=str(state.config))
+        differs = _difference(state, network, batch, config)
+        if differs is not None:  # an upgrade came between the attempts; loading it would fail each of them
+            log.warning("checkpoint_of_another_training", stage=self._name, differs=differs)
             return None
         self._tell_of_resuming(row, state.step)
         return state
@@ -124,6 +125,21 @@ def _own(job_id: UUID, state: TrainingState) -> TrainingState:
     """The state under the job's name: equal states of two jobs are two blobs, and deleting one keeps the other."""
     name = torch.tensor(list(job_id.bytes), dtype=torch.uint8)
     return replace(state, tensors={**state.tensors, "job": name})
+
+
+def _difference(state: TrainingState, network: Network, batch: SegmentBatch, config: TrainingConfig) -> str | None:
+    """Why training cannot go on from `state`; None where it can."""
+    if state.config != config:
+        return f"schedule {state.config}, now {config}"
+    shapes = {f"model.{name}": tensor.shape for name, tensor in network.state_dict().items()}
+    found = {name: tensor.shape for name, tensor in state.tensors.items() if name.startswith("model.")}
+    other = sorted(name for name in shapes.keys() | found.keys() if shapes.get(name) != found.get(name))
+    if other:
+        return f"{other[0]} of shape {found.get(other[0])}, now {shapes.get(other[0])}"
+    order = state.tensors.get("order")
+    if order is None or (state.step and len(order) != batch.size):
+        return f"{0 if order is None else len(order)} segments, now {batch.size}"
+    return None
 
 
 def _next_steps(steps: int, seconds: float) -> int:

@@ -18,7 +18,7 @@ from service.registry import TrainedModel
 from service.store.queries import acquisitions as scoring_queries
 from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
-from service.store.tables import JobRow, ProjectRow, RoundRow
+from service.store.tables import ProjectRow, RoundRow
 from workers import data
 from workers.evaluation import model_error
 from workers.job import RunningJob
@@ -64,19 +64,19 @@ def run_round(job: RunningJob, payload: TrainRound) -> dict[str, object]:
 def run_subgoal_generator(job: RunningJob, payload: TrainSubgoalGenerator) -> dict[str, object]:
     """Train the subgoal generator on the pool's observations, giving way to any other work.
 
-    The pool is the one that there was when the job was queued: a job that resumes goes on with the same segments.
+    The pool is the one that there was when the job was queued, by the members' ids and not by the clocks of several
+    machines: a job that resumes goes on with the same segments.
     """
     with job.worker.database.read() as session:
         project = projects.find(session, payload.project)
-        queued_at = session.get_one(JobRow, job.lease.job_id).created_at
+        members = pool_queries.memberships(session, project.id, "pool", last=payload.memberships)
         trained = round_queries.newest_model(session, project.id, "subgoal_generator")
-        if trained is not None and trained.created_at > queued_at:  # an earlier attempt ended between the two
+        if trained is not None and trained.watermark >= len(members):  # an attempt ended before its job was done
             return {"model": str(trained.id)}
-        members = [m for m in pool_queries.memberships(session, project.id, "pool") if m.created_at <= queued_at]
         windows = data.windows_of(session, project, members, None)
     every = max(1, sum(len(window.starts) for window in windows) // SUBGOAL_SEGMENTS)
     thinned = [data.Windows(w.trajectory, w.blob_sha256, w.starts[::every]) for w in windows if w.starts]
-    batch = data.load(job.worker.blobs, thinned, project.segment_length)
+    batch = data.load(job.worker.blobs, thinned, project.segment_length, job.go_on)
     family = _family(project)
     generator = _generator(project, 0, "subgoal_generator", 0)
     network = family.build_subgoal_generator(data.model_spaces(projects.spaces_of(project)), None, generator)
@@ -109,7 +109,8 @@ def _family(project: ProjectRow) -> Family:
 
 
 def _labels(job: RunningJob, plan: Plan, split: str) -> SegmentBatch | None:
-    return data.labeled_batch(job.worker.database, job.worker.blobs, plan.project, split, plan.round.watermark)
+    worker = job.worker
+    return data.labeled_batch(worker.database, worker.blobs, plan.project, split, plan.round.watermark, job.go_on)
 
 
 def _train_stage(job: RunningJob, plan: Plan, kind: str, member: int, labeled: SegmentBatch, number: int) -> None:
@@ -158,12 +159,15 @@ def _request_scoring(job: RunningJob, plan: Plan) -> dict[str, object]:
     """A strategy that needs models is scored under this round's; the others have nothing to wait for."""
     limits = scorings.limits_of(job.worker.settings)
     with job.transaction() as session:
+        project = projects.find(session, plan.project.id, lock=True)  # the project always comes before its round
         rounds.begin_scoring(session, plan.round.id, job.now())
+        round_row = rounds.find(session, plan.round.id, lock=True)
+        if round_row.status not in ("scoring", "current"):  # it ended while this job was at work
+            return {"round": str(round_row.id), "status": round_row.status}
         if not scorings.NEEDS[plan.strategy]:
             rounds.make_current(session, plan.round.id, job.now())
         elif scoring_queries.newest_scoring(session, plan.project.id, plan.strategy, plan.round.id) is None:
-            project = projects.find(session, plan.project.id)
-            scorings.start(session, project, plan.strategy, rounds.find(session, plan.round.id), job.now(), limits)
+            scorings.start(session, project, plan.strategy, round_row, job.now(), limits)
         models = round_queries.models_of(session, plan.round.id)
     return {"round": str(plan.round.id), "models": len(models)}
 

@@ -116,9 +116,9 @@ def _loaded(worker: Worker, project_id: UUID) -> tuple[Models, SegmentBatch]:
     with worker.database.read() as session:
         project = projects.find(session, project_id)
         current = round_queries.current_round(session, project_id)
-        models = load_models(session, worker.blobs, project, current.id if current else None)
         members = pool_queries.memberships(session, project_id, "pool")
         windows = data.windows_of(session, project, members, None)
+    models = load_models(worker.database, worker.blobs, project, current.id if current else None)
     return models, data.load(worker.blobs, windows, project.segment_length)
 
 

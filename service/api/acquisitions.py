@@ -40,6 +40,8 @@ async def acquire(
         state = await run_in_threadpool(_state, held, AcquisitionPending.model_validate_json(answer.body).job)
         if state in ("failed", "cancelled"):
             break  # who asked learns of it from the job that the answer names, and may ask again
+        if await http.is_disconnected():
+            break  # nobody would label what was leased now
         if state == "done":
             answer = await run_in_threadpool(_acquired, held, request, use)
     response = answer.response()
@@ -55,15 +57,15 @@ def show_acquisition(acquisition_id: UUID, session: ReadSession, now: Now) -> Ac
 
 
 @router.post("/acquisitions/{acquisition_id}/extend", dependencies=[acquirer])
-def extend(acquisition_id: UUID, request: ExtendRequest, session: WriteSession, now: Now) -> Acquisition:
-    row = leases.extend(session, acquisition_id, request.token, request.lease_seconds, now)
-    return acquisitions.describe(session, row, now, with_token=True)
+def extend(acquisition_id: UUID, request: ExtendRequest, session: WriteSession, held: ServicesDep) -> Acquisition:
+    row = leases.extend(session, acquisition_id, request.token, request.lease_seconds, held.clock)
+    return acquisitions.describe(session, row, held.clock(), with_token=True)
 
 
 @router.post("/acquisitions/{acquisition_id}/release", dependencies=[acquirer])
-def release(acquisition_id: UUID, request: ReleaseRequest, session: WriteSession, now: Now) -> Acquisition:
-    row = leases.release(session, acquisition_id, request.token, now)
-    return acquisitions.describe(session, row, now, with_token=False)
+def release(acquisition_id: UUID, request: ReleaseRequest, session: WriteSession, held: ServicesDep) -> Acquisition:
+    row = leases.release(session, acquisition_id, request.token, held.clock)
+    return acquisitions.describe(session, row, held.clock(), with_token=False)
 
 
 def _acquired(held: Services, request: AcquireRequest, use: KeyUse | None) -> Answer:
@@ -72,11 +74,10 @@ def _acquired(held: Services, request: AcquireRequest, use: KeyUse | None) -> An
         now = held.clock()
 
         def rule() -> Answer:
-            given = acquisitions.acquire(session, request, now, held.limits)
+            given = acquisitions.acquire(session, request, held.clock, held.limits)
             if isinstance(given, JobRow):
                 return _pending(given)
-            body = acquisitions.describe(session, given, now, with_token=True)
-            return Answer(201, body.model_dump_json(), f"/acquisitions/{given.id}")
+            return Answer(201, given.model_dump_json(), f"/acquisitions/{given.id}")
 
         return answered_once(session, use, held.settings, now, rule)
 

@@ -10,7 +10,7 @@ from api_schemas.events import Event
 from api_schemas.jobs import Job
 from service import cancellation, events, jobs, projects
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, WriteSession, requires
-from service.store.queries.events import settled
+from service.store.queries.events import ORDER, settled
 from service.store.queries.listing import page
 from service.store.tables import EventRow, JobRow
 
@@ -45,7 +45,6 @@ def cancel_job(job_id: UUID, session: WriteSession, now: Now) -> Job:
 @router.get("/events")
 def list_events(
     session: ReadSession,
-    now: Now,
     project: UUID | None = None,
     newest: Annotated[bool, Query(description="newest first")] = False,
     cursor: Cursor = None,
@@ -53,7 +52,7 @@ def list_events(
 ) -> Page[Event]:
     if project is not None:
         projects.find(session, project)
-    where = [] if newest else [settled(now)]
+    where = [] if newest else [settled()]
     where += [] if project is None else [EventRow.project_id == project]
-    rows, after = page(session, EventRow, where, (EventRow.id,), cursor, limit, newest_first=newest)
+    rows, after = page(session, EventRow, where, ORDER, cursor, limit, newest_first=newest)
     return Page(items=[events.describe(row) for row in rows], next=after)

@@ -1,21 +1,23 @@
 """/labels."""
 
+from datetime import datetime
 from uuid import UUID
 
 from fastapi import APIRouter, Depends, Request, Response
 
 from api_schemas.base import Page
 from api_schemas.environments import Spaces
-from api_schemas.labels import Label, LabelsAccepted, LabelsRequest
+from api_schemas.labels import MOST_SEGMENTS, Label, LabelsAccepted, LabelsRequest
 from service import labels, pool, projects
 from service.actions import check_actions
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep, requires
-from service.api.once import Answer, IdempotencyKey, answered_once, key_use
+from service.api.once import Answer, IdempotencyKey, answered_once, kept_answer, key_use
 from service.errors import InvalidField
+from service.idempotency import KeyUse
 from service.labels import LabeledUpload
 from service.store import npz
 from service.store.queries.listing import page
-from service.store.tables import LabelRow
+from service.store.tables import LabelRow, ProjectRow
 
 router = APIRouter(prefix="/labels", tags=["labels"])
 reader, labeler = Depends(requires("read")), Depends(requires("label"))
@@ -27,11 +29,14 @@ def add_labels(
 ) -> Response:
     if not request.items and not request.trajectories:
         raise InvalidField("items", [], "must hold a label, or trajectories a labeled trajectory")
-    use, uploads = key_use(http, idempotency_key, request), _store_trajectories(held, request)
+    use = key_use(http, idempotency_key, request)
+    if request.trajectories and (kept := _kept(held, use, now)):
+        return kept.response()
+    uploads = _store_trajectories(held, request)
     with held.database.write() as session:
 
         def rule() -> Answer:
-            accepted = labels.accept(session, request, uploads, now, held.settings.job_max_attempts)
+            accepted = labels.accept(session, request, uploads, held.clock, held.settings.job_max_attempts)
             return Answer(201, accepted.model_dump_json())
 
         answer = answered_once(session, use, held.settings, now, rule)
@@ -45,12 +50,33 @@ def list_labels(project: UUID, session: ReadSession, cursor: Cursor = None, limi
     return Page(items=[labels.describe(row) for row in rows], next=after)
 
 
+def _kept(held: Services, use: KeyUse | None, now: datetime) -> Answer | None:
+    """Asked before any blob is stored: a repetition needs neither the work nor the blob store."""
+    with held.database.read() as session:
+        return kept_answer(session, use, now)
+
+
+def _check_size(project: ProjectRow, request: LabelsRequest) -> None:
+    """One transaction, under the project's lock, writes a row a segment. Raises InvalidField."""
+    total = sum(
+        pool.segment_count(len(one.actions), project.segment_length, project.stride)
+        if one.starts is None
+        else len(one.starts)
+        for one in request.trajectories
+    )
+    if total > MOST_SEGMENTS:
+        reason = f"must hold at most {MOST_SEGMENTS} segments in one request; `starts` chooses some of a trajectory's"
+        raise InvalidField("trajectories: segments", total, reason)
+
+
 def _store_trajectories(held: Services, request: LabelsRequest) -> list[LabeledUpload]:
     """Blobs first, outside the transaction: they are named by content, so a crash before the rows does no harm."""
     if not request.trajectories:
         return []
     with held.database.read() as session:
-        spaces: Spaces = projects.spaces_of(projects.find(session, request.project))
+        project = projects.find(session, request.project)
+        spaces: Spaces = projects.spaces_of(project)
+    _check_size(project, request)
     uploads = []
     for position, trajectory in enumerate(request.trajectories):
         name = f"trajectories[{position}]"

@@ -15,6 +15,7 @@ from service import idempotency
 from service.errors import InvalidField
 from service.idempotency import KeyUse
 from service.settings import Settings
+from service.store.tables import IdempotencyRow
 
 LONGEST_WAIT = 30.0  # seconds that an answer is held back at most
 IdempotencyKey = Annotated[
@@ -52,6 +53,12 @@ def key_use(request: Request, key: str | None, body: Schema) -> KeyUse | None:
     return KeyUse(request.state.caller, f"{request.method} {request.url.path}", key, digest)
 
 
+def kept_answer(session: Session, use: KeyUse | None, now: datetime) -> Answer | None:
+    """The answer that is kept for this key, if any: for who would do much before the rule. Changes nothing."""
+    kept = None if use is None else idempotency.find(session, use, now)
+    return None if kept is None else _replay(kept)
+
+
 def answered_once(
     session: Session, use: KeyUse | None, settings: Settings, now: datetime, rule: Callable[[], Answer]
 ) -> Answer:
@@ -59,8 +66,9 @@ def answered_once(
     if use is None:
         return rule()
     kept = idempotency.begin(session, use, now, timedelta(hours=settings.idempotency_hours))
-    if kept.status is not None:
-        return Answer(kept.status, kept.body or "", kept.location, {"Idempotency-Replayed": "true"})
+    replay = _replay(kept)
+    if replay is not None:
+        return replay
     answer = rule()
     if answer.status == 202:
         idempotency.forget(session, kept)
@@ -73,3 +81,10 @@ def wait_seconds(prefer: str | None) -> float:
     """Of a Prefer header; 0 where it does not ask to wait. Preferences are wishes: what is not understood is left."""
     found = re.search(r"(?:^|[,;\s])wait\s*=\s*\"?(\d{1,6})", prefer or "", re.IGNORECASE)
     return min(float(found[1]), LONGEST_WAIT) if found else 0.0
+
+
+def _replay(kept: IdempotencyRow) -> Answer | None:
+    """None where the request is still to be done."""
+    if kept.status is None:
+        return None
+    return Answer(kept.status, kept.body or "", kept.location, {"Idempotency-Replayed": "true"})

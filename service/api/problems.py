@@ -5,7 +5,8 @@ from http import HTTPStatus
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from sqlalchemy.exc import DataError, InterfaceError, OperationalError, TimeoutError  # noqa: A004  (of the pool)
+from sqlalchemy.exc import DataError, InterfaceError, InternalError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
 from api_schemas.errors import PROBLEM_JSON, InvalidParam, Problem
@@ -13,6 +14,8 @@ from service.errors import BodyTooLarge, ServiceError
 from service.log import get_logger
 
 log = get_logger("api")
+# A database that is down, full or slow; "internal" is what PostgreSQL calls that it ended an idle transaction.
+OUTAGES = (OperationalError, InterfaceError, InternalError, PoolTimeout)
 HEADERS = {401: {"WWW-Authenticate": "Bearer"}, 503: {"Retry-After": "1"}}  # what a status says beside its body
 
 
@@ -22,7 +25,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _malformed)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(DataError, _unstorable)
-    for unavailable in (OperationalError, InterfaceError, TimeoutError):
+    for unavailable in OUTAGES:
         app.add_exception_handler(unavailable, _database_error)
     app.add_exception_handler(Exception, _unexpected)
 
@@ -72,10 +75,8 @@ def _unstorable(request: Request, error: Exception) -> JSONResponse:
 
 def _database_error(request: Request, error: Exception) -> JSONResponse:
     log.error("database_error", path=request.url.path, error=str(error))
-    detail = "the database did not answer in time; nothing was stored, try again"
-    return answer(
-        _problem("database-unavailable", 503, "The database is unavailable", detail, request), {"Retry-After": "1"}
-    )
+    detail = "the database did not answer, or not in time; what was sent is stored as a whole or not at all, try again"
+    return answer(_problem("database-unavailable", 503, "The database is unavailable", detail, request), HEADERS[503])
 
 
 def _unexpected(request: Request, error: Exception) -> JSONResponse:

@@ -12,6 +12,11 @@ from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
+from service.settings import POOL_SIZE
+from service.store.queries.events import keep_order
+
+WAITS = {"lock_timeout": 15_000, "idle_in_transaction_session_timeout": 30_000}  # milliseconds, on PostgreSQL
+
 
 @dataclass(frozen=True)
 class Database:
@@ -38,10 +43,13 @@ class Database:
         self.engine.dispose()
 
 
-def open_database(url: str) -> Database:
-    """Open, without migrating. Threads may share it; processes open their own."""
+def open_database(url: str, pool_size: int = POOL_SIZE) -> Database:
+    """Open, without migrating. Threads may share it; processes open their own.
+
+    pool_size: connections at most, opened as they are needed.
+    """
     server = {} if url.startswith("sqlite") else {"pool_pre_ping": True, "connect_args": {"connect_timeout": 5}}
-    engine = create_engine(url, pool_size=48, max_overflow=0, **server)
+    engine = create_engine(url, pool_size=pool_size, max_overflow=0, **server)
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _configure_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
@@ -56,12 +64,17 @@ def open_database(url: str) -> Database:
 
 
 def migrate(url: str, revision: str = "head") -> None:
-    """Upgrade the schema to `revision`."""
+    """Upgrade the schema to `revision`; at the newest, what is written from now on comes after all that is there."""
     config = Config()
     config.set_main_option("script_location", "service.store:migrations")
     config.set_main_option("path_separator", "os")
     config.attributes["url"] = url
     command.upgrade(config, revision)
+    if revision == "head":
+        database = open_database(url)
+        with database.write() as session:
+            keep_order(session)
+        database.close()
 
 
 def _configure_sqlite(connection: DBAPIConnection, _: ConnectionPoolEntry) -> None:
@@ -76,7 +89,7 @@ def _configure_postgresql(connection: DBAPIConnection, _: ConnectionPoolEntry) -
     """Nobody waits for ever: for a row that another holds, or because a frozen process sits on an open transaction."""
     autocommit = connection.autocommit
     connection.autocommit = True  # else the pool's first rollback takes the settings back
-    for name, milliseconds in (("lock_timeout", 15_000), ("idle_in_transaction_session_timeout", 30_000)):
+    for name, milliseconds in WAITS.items():
         connection.cursor().execute(f"SET {name} = {milliseconds}")
     connection.autocommit = autocommit
 

@@ -315,7 +315,10 @@ class JobRow(Row):
     created_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
-    __table_args__ = (Index("ix_job_claim", "state", "queue", "priority", "created_at"),)
+    __table_args__ = (
+        Index("ix_job_claim", "state", "queue", "priority", "created_at"),
+        Index("ix_job_finished", "queue", "finished_at"),
+    )
 
 
 class EventRow(Row):
@@ -330,7 +333,18 @@ class EventRow(Row):
     correlation: Mapped[str] = mapped_column(String(100), default="")
     transaction: Mapped[int] = mapped_column(BigInteger, default=CurrentTransaction())
     created_at: Mapped[datetime]
-    __table_args__ = (Index("ix_event_project", "project_id", "id"),)
+    __table_args__ = (
+        Index("ix_event_project", "project_id", "transaction", "id"),
+        Index("ix_event_order", "transaction", "id"),
+    )
+
+
+class EventEpochRow(Row):
+    """One row: `added` to the numbers of the database server's transactions, which another server counts anew."""
+
+    __tablename__ = "event_epoch"
+    id: Mapped[int] = mapped_column(primary_key=True)
+    added: Mapped[int] = mapped_column(BigInteger)
 
 
 class IdempotencyRow(Row):

@@ -264,7 +264,7 @@ def test_a_lost_lease_is_a_conflict_of_its_own() -> None:
 
 def test_followed_events_come_once_each_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     pauses: list[float] = []
-    monkeypatch.setattr("asim.client.time.sleep", pauses.append)
+    monkeypatch.setattr("asim.calls.jobs.time.sleep", pauses.append)
     pages = [([1, 2], "a"), ([3], None), ([3, 4], None), ([3, 4, 5], "b"), ([6], None)]
     script = Script(
         *(httpx.Response(200, json={"items": [event(each) for each in ids], "next": cursor}) for ids, cursor in pages)

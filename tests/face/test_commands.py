@@ -85,6 +85,17 @@ def test_recordings_are_imported_once_and_labeled_ones_with_their_labels(
         assert stored == {start: [action] for start, action in enumerate(file["actions"].tolist())}
 
 
+def test_a_recording_of_more_segments_than_a_request_takes_is_sent_in_several(
+    asim: Asim, own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("asim.importing.MOST_SEGMENTS", 5)
+    labeled = [str(recording(tmp_path / f"{seed}.npz", seed, labeled=True)) for seed in (1, 2)]
+    printed = asim("import", own, *labeled, "--split", "pool")
+    assert re.findall(r"(\d+) labels, (\d+) known", printed) == [("5", "0"), ("5", "0"), ("2", "0")] * 2
+    counts = json.loads(asim("project", "show", own))["counts"]
+    assert (counts["pool_trajectories"], counts["labeled"]) == (2, 24)
+
+
 def test_a_policy_is_changed_field_by_field(asim: Asim, own: str) -> None:
     policy = json.loads(asim("project", "set", own, "--strategy", "random", "--label-budget", "5"))
     assert (policy["strategy"], policy["label_budget"], policy["round_labels"]) == ("random", 5, 0)

@@ -75,7 +75,8 @@ def served(_embedded: Served) -> Iterator[Served]:
     yield _embedded
     with _embedded.services.database.write() as session:
         for table in reversed(Row.metadata.sorted_tables):
-            session.execute(delete(table))
+            if table.name != "event_epoch":
+                session.execute(delete(table))
     for path in [path for path in _embedded.settings.data_folder.glob("*/*") if path.is_dir()]:
         shutil.rmtree(path)
 

@@ -150,7 +150,7 @@ class Served:
         deadline = time.monotonic() + 20
         while True:
             items: list[Json] = self.get("/events", project=project, limit=1000)["items"]
-            if items and items[-1]["id"] >= newest:
+            if newest in [item["id"] for item in items]:
                 return items
             assert time.monotonic() < deadline, f"event {newest} is not listed"
             time.sleep(0.02)

@@ -1,5 +1,6 @@
 """One Idempotency-Key, one effect, one answer: repeated, at once, by others, later; a refusal is not kept."""
 
+import base64
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
@@ -9,8 +10,10 @@ from uuid import uuid4
 import pytest
 from httpx2 import Response
 
+from service.errors import BlobsUnavailable
+from service.store.blobs import Blobs
 from tests.service.conftest import Serve
-from tests.service.kit import Json, Served, answers, refused, room
+from tests.service.kit import Json, Served, answers, npz, refused, room
 from tests.service.test_security import key
 
 CALLERS = 20
@@ -163,6 +166,38 @@ def test_a_key_is_forgotten_after_its_time(on_both: Served) -> None:
     again = once(on_both, "/acquire", {"project": project, "count": 2}, named)
     assert (again.status_code, replayed(again)) == (201, False)
     assert again.json()["id"] != first.json()["id"]
+
+
+def test_a_key_that_is_used_again_at_once_after_its_time_stands_for_one_request(on_both: Served) -> None:
+    project, headers = filled(on_both), {"Idempotency-Key": uuid4().hex}
+    body = {"project": project, "items": answers(on_both.acquire(project, 1))}
+    on_both.clock.advance(3600)  # the lease ends
+    for _ in range(5):
+        given = at_once(on_both, [body] * CALLERS, **headers)
+        assert {answer.status_code for answer in given} == {201}
+        assert len({answer.content for answer in given}) == 1
+        assert sum(not replayed(answer) for answer in given) == 1
+        on_both.clock.advance(on_both.settings.idempotency_hours * 3600 + 60)
+    assert on_both.show(project)["label_watermark"] == 1
+
+
+def test_labeled_trajectories_sent_twice_need_no_blob_store_for_the_known_answer(
+    on_both: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object) -> None:
+        raise BlobsUnavailable("trajectories/x", "it is away")
+
+    project, named = on_both.project(), uuid4().hex
+    upload = {"content": base64.b64encode(npz(room(0))).decode(), "actions": [0] * 5}
+    body = {"project": project, "trajectories": [upload]}
+    first = once(on_both, "/labels", body, named)
+    monkeypatch.setattr(Blobs, "put", away)
+    second = once(on_both, "/labels", body, named)
+    assert (first.status_code, second.status_code, replayed(second)) == (201, 201, True)
+    assert second.content == first.content
+    other = body | {"trajectories": [upload | {"starts": [0]}]}
+    refused(once(on_both, "/labels", other, named), 422, "idempotency-key-reused")
+    refused(once(on_both, "/labels", body, uuid4().hex), 503, "blobs-unavailable")
 
 
 def test_a_refused_request_keeps_nothing(on_both: Served) -> None:

@@ -1,12 +1,15 @@
 """The job table: claimed by priority under a lease and a fence, taken from the silent, at last given up."""
 
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from uuid import UUID, uuid4
 
 import pytest
 from httpx2 import Response
 from sqlalchemy import select
 from sqlalchemy.orm import Session
+from structlog.testing import capture_logs
 
 from api_schemas.jobs import JobPayload, ScoreShard, TrainRound, TrainSubgoalGenerator
 from service import canary, jobs, reaper, rounds, scorings
@@ -39,14 +42,12 @@ def claimed(served: Served, *queues: str, owner: str = "ada") -> jobs.Lease:
 
 
 def reap(served: Served) -> None:
-    with served.services.database.write() as session:
-        reaper.reap(session, served.clock())
+    reaper.reap(served.services.database, served.clock())
 
 
 def kinds(served: Served, project: str) -> list[str]:
     """Kinds of the events about jobs, oldest first."""
-    rows = served.get("/events", project=project, limit=1000)["items"]
-    return [row["kind"] for row in rows if row["kind"].startswith("job.")]
+    return [row["kind"] for row in served.events(project) if row["kind"].startswith("job.")]
 
 
 def round_asked_for(served: Served, project: str) -> str:
@@ -464,8 +465,50 @@ def test_a_canary_that_failed_is_planted_again(served: Served) -> None:
 def test_no_job_gives_way_to_a_canary(served: Served) -> None:
     project = served.project()
     enqueue(served, project, generator(project))
-    running = RunningJob(served.worker("train"), claimed(served))
+    worker = served.worker("train")
+    early = RunningJob(worker, claimed(served))
+    at_once = worker.settings.model_copy(update={"checkpoint_seconds": 1e-9})
+    running = RunningJob(replace(worker, settings=at_once), early.lease)
     plant(served)
     assert not running.should_give_way()
     enqueue(served, project, TrainRound(round=uuid4(), strategy="cycle"))
     assert running.should_give_way()
+    assert not early.should_give_way()  # its attempt has not brought it any further yet
+    worker.stopping.set()
+    assert early.should_give_way()
+    worker.stopping.clear()
+
+
+def test_a_job_that_has_said_nothing_for_long_is_not_renewed_and_goes_to_another(on_both: Served) -> None:
+    project = on_both.project()
+    worker = on_both.worker("train")
+    bounded = replace(worker, settings=worker.settings.model_copy(update={"silence_seconds": 0.2}))
+    job = enqueue(on_both, project, generator(project))
+    with on_both.services.database.write() as session:
+        row = jobs.claim(session, job, worker.owner, on_both.clock(), LEASE)
+        assert row is not None
+        running = RunningJob(bounded, jobs.lease_of(row))
+    with capture_logs() as said:
+        for step in (running.go_on, lambda: running.report(0.5, "step 1"), lambda: _write(running)):
+            time.sleep(0.25)
+            step()  # it was slow, and is not hung
+            on_both.clock.advance(LEASE - 1)
+            running.beat()
+            reap(on_both)
+            assert on_both.get(f"/jobs/{job}")["state"] == "running"
+        time.sleep(0.25)
+        on_both.clock.advance(LEASE - 1)
+        running.beat()
+        on_both.clock.advance(2)
+        running.beat()
+        reap(on_both)
+    assert on_both.get(f"/jobs/{job}")["state"] == "queued"
+    hangs = [(line["job"], line["last"]) for line in said if line["event"] == "job_hangs"]
+    assert hangs == [(str(job), "step 1")]
+    with pytest.raises(JobLost):
+        _write(running)
+
+
+def _write(running: RunningJob) -> None:
+    with running.transaction():
+        pass

@@ -4,13 +4,15 @@ import base64
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 import pytest
 from httpx2 import Response
 from sqlalchemy import text
 
-from service import leases
+from api_schemas.jobs import TrainSubgoalGenerator
+from service import jobs, leases, projects
 from tests.service.kit import Arrays, Json, Served, answers, npz, refused, room, segments
 
 LENGTH = 2
@@ -230,6 +232,32 @@ def test_the_sweep_of_expired_leases_undoes_nothing_that_its_holder_does_meanwhi
         assert meanwhile.result(timeout=20).status_code == 200
     shown = on_postgres.get(f"/acquisitions/{batch['id']}")
     assert shown["status"] == {"extend": "leased", "release": "released"}[what]
+
+
+def test_a_lease_that_ends_while_another_waits_for_the_project_counts_as_ended(on_postgres: Served) -> None:
+    project = on_postgres.project()
+    on_postgres.upload(project, room(0, 1))
+    first = on_postgres.acquire(project, 1, lease_seconds=60)
+    with ThreadPoolExecutor(1) as threads:
+        with on_postgres.services.database.write() as session:
+            projects.find(session, UUID(project), lock=True)
+            meanwhile = threads.submit(on_postgres.ask, project)
+            _until_somebody_waits(on_postgres)
+            on_postgres.clock.advance(61)
+        answer = meanwhile.result(timeout=20)
+    assert answer.status_code == 201, answer.text
+    assert segments(answer.json()) == segments(first)
+    lease = {"token": first["token"], "lease_seconds": 60}
+    refused(on_postgres.client.post(f"/acquisitions/{first['id']}/extend", json=lease), 410, "lease-lost")
+
+
+def test_rows_that_refer_to_a_locked_project_are_written_all_the_same(on_postgres: Served) -> None:
+    project = UUID(on_postgres.project())
+    with on_postgres.services.database.write() as session:
+        projects.find(session, project, lock=True)
+        with on_postgres.services.database.write() as other:
+            other.connection().exec_driver_sql("SET LOCAL lock_timeout = 2000")
+            jobs.enqueue(other, project, TrainSubgoalGenerator(project=project), project, on_postgres.clock())
 
 
 def _until_somebody_waits(served: Served) -> None:

@@ -18,7 +18,7 @@ from sqlalchemy.exc import DBAPIError
 
 from service.settings import Settings
 from service.store.database import migrate, open_database
-from service.store.tables import Row
+from service.store.tables import EventEpochRow, Row
 from tests.service.first_schema import EMPTY, FIRST, NAMES, SECOND, fill, narrowed, read, write
 from tests.service.kit import Served, serve
 
@@ -142,7 +142,8 @@ def test_the_tables_read_every_row_of_an_upgraded_database(url: str) -> None:
     with database.read() as session:
         for mapper in Row.registry.mappers:
             found = session.scalars(select(mapper.class_)).all()
-            assert len(found) == len(before.get(mapper.class_.__tablename__, [])), mapper
+            there = 1 if mapper.class_ is EventEpochRow else len(before.get(mapper.class_.__tablename__, []))
+            assert len(found) == there, mapper
     database.close()
 
 

@@ -105,6 +105,21 @@ def test_a_queue_whose_worker_is_at_work_is_served(served: Served) -> None:
     assert readiness(served)[0] == 503
 
 
+def test_a_queue_that_works_off_jobs_is_served_though_its_canary_is_late(served: Served) -> None:
+    do_canaries(served, *QUEUES)
+    served.clock.advance(61)
+    project = served.project()
+    served.upload(project, room(0))
+    served.acquire(project)  # jobs of the queue `score`
+    do_canaries(served, "train", "label")
+    status, ready = readiness(served)
+    assert ready["canaries"]["score"] > 60
+    assert status == 200
+    served.clock.advance(61)
+    do_canaries(served, "train", "label")
+    assert readiness(served)[0] == 503
+
+
 def test_readiness_says_which_store_is_gone(start: Serve) -> None:
     served = start()
     do_canaries(served, *QUEUES)

@@ -1,11 +1,18 @@
 """`Prefer: wait` holds an answer back until there is a batch, or the time is over."""
 
+import json
+import socket
+import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 import pytest
+import uvicorn
 from httpx2 import Response
 
+from tests.loop.processes import eventually
 from tests.service.kit import Served, room
 
 
@@ -48,6 +55,37 @@ def test_when_the_time_is_over_the_answer_is_the_job_to_wait_for(served: Served)
     assert answer.headers["retry-after"] == "1"
     assert answer.headers["location"] == f"/jobs/{answer.json()['job']}"
     assert len(served.get("/jobs", project=project)["items"]) == 1
+
+
+@contextmanager
+def listening(served: Served) -> Iterator[int]:
+    """The service on a real socket; its port."""
+    config = uvicorn.Config(served.app, port=0, lifespan="off", log_level="warning")
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, args=([listener],))
+        thread.start()
+        eventually(lambda: server.started, 20, "the service does not listen")
+        try:
+            yield int(listener.getsockname()[1])
+        finally:
+            server.should_exit = True
+            thread.join(timeout=30)
+    assert not thread.is_alive()
+
+
+def test_nothing_is_leased_for_a_client_that_has_gone(served: Served) -> None:
+    project = fresh(served)
+    body = json.dumps({"project": project, "count": 2}).encode()
+    head = "POST /acquire HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nPrefer: wait=25\r\n"
+    with listening(served) as port:
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            client.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)
+            eventually(lambda: bool(served.get("/jobs", project=project)["items"]), 20, "the request does not wait")
+        served.drain()
+    assert served.show(project)["counts"]["leased"] == 0
+    assert not [event for event in served.events(project) if event["kind"] == "lease.given"]
 
 
 @pytest.mark.parametrize(

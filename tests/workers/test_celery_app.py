@@ -9,8 +9,9 @@ import pytest
 from celery import Celery
 from redis import Redis
 
-from service import jobs
-from service.carrier import Relay, celery_app, impatient_app, messages_in, relay
+from api_schemas.jobs import ScoreShard, TrainSubgoalGenerator
+from service import canary, jobs
+from service.carrier import BATCH, Relay, celery_app, impatient_app, messages_in, relay
 from service.settings import Settings
 from service.store.tables import JobRow
 from tests.loop.processes import eventually
@@ -53,7 +54,8 @@ class Sent(Celery):  # type: ignore[misc]  # celery has no types
 def sent(loop: Loop, job: UUID | None) -> bool:
     """Whether the carrier was given the job."""
     with loop.worker.database.read() as session:
-        return job is not None and session.get_one(JobRow, job).sent_at is not None
+        row = None if job is None else session.get(JobRow, job)
+        return row is not None and row.sent_at is not None
 
 
 @pytest.fixture
@@ -81,6 +83,52 @@ def test_a_job_is_sent_again_when_nobody_claims_it_and_its_message_is_lost(
     assert relayed(carried.resend_seconds + 1) == 2
     assert messages_in(app, queue) == 2
     app.close()
+
+
+def test_a_lost_message_is_found_behind_another_queues_backlog(
+    labeled: Loop, carried: Settings, redis_space: RedisSpace
+) -> None:
+    app, database, project = impatient_app(carried), labeled.worker.database, labeled.project.id
+    backlog = BATCH + 5
+    with database.write() as session:
+        for _ in range(backlog):
+            jobs.enqueue(session, project, TrainSubgoalGenerator(project=project), project, labeled.clock())
+
+    def relayed(seconds: float) -> int:
+        return relay(database, app, carried, labeled.clock() + timedelta(seconds=seconds))
+
+    assert relayed(0) + relayed(0) == backlog
+    with database.write() as session:
+        lost = jobs.enqueue(session, project, ScoreShard(scoring=project, shard=0), project, labeled.clock()).id
+    assert relayed(0) == 1
+    with Redis.from_url(redis_space.url) as broker:
+        assert broker.delete(f"{redis_space.prefix}:{redis_space.prefix}.score") == 1
+    before = labeled.clock()
+    assert relayed(carried.resend_seconds + 1) == 1
+    assert messages_in(app, f"{redis_space.prefix}.score") == 1
+    assert messages_in(app, f"{redis_space.prefix}.train") == backlog
+    with database.read() as session:
+        sent_at = session.get_one(JobRow, lost).sent_at
+    assert sent_at is not None
+    assert sent_at > before
+    app.close()
+
+
+def test_messages_are_sent_and_canaries_planted_while_the_reaper_fails(
+    labeled: Loop, carried: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any) -> None:
+        raise LookupError("a row that cannot be reaped")
+
+    monkeypatch.setattr("service.reaper.reap", broken)
+    asked = labeled.client.start_round(labeled.project.id)
+    running = Relay(labeled.worker.database, carried, labeled.clock)
+    running.start()
+    try:
+        eventually(lambda: sent(labeled, asked.job), 20, "nothing is sent")
+        eventually(lambda: sent(labeled, canary.job_id("train")), 20, "no canary is sent")
+    finally:
+        running.stop()
 
 
 def test_a_relay_goes_on_when_the_broker_is_back(labeled: Loop) -> None:

@@ -13,12 +13,13 @@ from api_schemas.acquisitions import Acquisition, AcquisitionItem
 from api_schemas.environments import Environment
 from api_schemas.labels import Label, LabelsAccepted, LabelsRequest
 from asim.client import Client
-from asim.errors import Conflict, LeaseLost
-from tests.workers.conftest import ROOM, OpenLoop
+from asim.errors import Conflict, Invalid, LeaseLost
+from tests.workers.conftest import ROOM, OpenLoop, new_project
 from tests.workers.in_process import Loop, segments_of
-from workers import delivery
+from workers import delivery, labeling
 from workers.explanation import explain
-from workers.labeling import UnexplainedStep, run_labeling
+from workers.labeling import EndedEarly, UnexplainedStep, run_labeling
+from workers.simulators.base import Simulator
 from workers.simulators.catalog import make_simulator
 from workers.simulators.minigrid import ACTION_NAMES, DROP, NOTHING
 
@@ -264,6 +265,107 @@ def test_a_lease_that_was_given_back_ends_the_labeling_at_once(labeled: Loop) ->
     assert done == [1]
 
 
+def test_a_label_that_the_service_finds_fault_with_is_named_and_the_others_are_stored(
+    labeled: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch, before = labeled.acquire(20, "random"), labeled.project.label_watermark
+    wrong = [batch.items[3], batch.items[11]]
+    _spoil(monkeypatch, {(item.trajectory, item.start) for item in wrong})
+    with pytest.raises(Invalid) as caught:
+        run_labeling(labeled.client, batch, np.random.default_rng(0))
+    first, second = (f"segment {item.trajectory}:{item.start}" for item in wrong)
+    assert first in str(caught.value)
+    assert [second in note for note in caught.value.__notes__] == [True]
+    assert labeled.project.label_watermark == before + 18
+    answered = labeled.client.acquisition(batch.id)
+    assert [item.rank for item in answered.items if not item.labeled] == [3, 11]
+    assert (answered.status, labeled.project.counts.leased) == ("released", 0)
+
+
+def test_a_service_that_finds_fault_with_every_label_is_not_asked_about_each(
+    labeled: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = labeled.acquire(300, "random")
+    _spoil(monkeypatch, {(item.trajectory, item.start) for item in batch.items})
+    sizes: list[int] = []
+    _measure(monkeypatch, labeled, sizes)
+    with pytest.raises(Invalid):
+        run_labeling(labeled.client, batch, np.random.default_rng(0))
+    assert len(sizes) < 60  # of 599 that it would take to have each stand alone
+    assert labeled.client.acquisition(batch.id).status == "released"
+
+
+def test_an_exploration_whose_episode_ends_early_is_given_back_and_the_others_are_stored(
+    empty: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty.name = "long"
+    new_project(empty, segment_length=3)
+    empty.collect(300, seed=1, split="pool")
+    batch = empty.acquire(6, mode="explore")
+    _end_episodes(monkeypatch, batch, rank=2, after=2)
+    with pytest.raises(EndedEarly, match=r"^item 2, .*: the episode ended after 2 transitions, .* needs 3$"):
+        run_labeling(empty.client, batch, np.random.default_rng(0))
+    answered = empty.client.acquisition(batch.id)
+    assert [item.rank for item in answered.items if not item.labeled] == [2]
+    assert (answered.status, empty.project.budget.reserved) == ("released", 0)
+
+
+@pytest.mark.parametrize("how", ["released", "taken"])
+def test_a_lease_that_holds_nothing_any_more_is_found_out_by_one_question(
+    labeled: Loop, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    batch = labeled.acquire(labeled.project.counts.unlabeled, "random", lease_seconds=60)
+
+    def overslept(done: int, of: int) -> None:
+        if done == of and how == "released":
+            labeled.client.release(batch.id, batch.token or 0)
+        elif done == of:
+            labeled.clock.advance(90)
+            labeled.acquire(of, "random")
+
+    sizes: list[int] = []
+    _measure(monkeypatch, labeled, sizes)
+    with pytest.raises(LeaseLost, match="the lease was lost while its"):
+        run_labeling(labeled.client, batch, np.random.default_rng(0), overslept, labeled.clock)
+    assert len(sizes) == len(range(0, len(batch.items), delivery.BATCH))  # none was halved
+
+
+def test_a_budget_without_room_for_one_label_is_not_asked_about_each(
+    labeled: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lease had ended, and what it had reserved was spent by others meanwhile: but for five labels."""
+    batch = labeled.acquire(200, "random", lease_seconds=60)
+    before = labeled.project.counts.labeled
+
+    def overslept(done: int, of: int) -> None:
+        if done == of:
+            labeled.clock.advance(90)
+            labeled.change(label_budget=before + 5)
+
+    sizes: list[int] = []
+    _measure(monkeypatch, labeled, sizes)
+    with pytest.raises(Conflict, match="budget"):
+        run_labeling(labeled.client, batch, np.random.default_rng(0), overslept)
+    assert labeled.project.counts.labeled == before + 5
+    assert len(sizes) < 30
+
+
+def test_where_all_is_labeled_the_lease_is_asked_about_once(labeled: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = labeled.acquire(10, "random", lease_seconds=60)
+    run_labeling(labeled.client, batch, np.random.default_rng(0))
+    labeled.clock.advance(90)
+    asked: list[object] = []
+    extend = labeled.client.extend
+
+    def counted(*args: Any) -> Acquisition:
+        asked.append(args)
+        return extend(*args)
+
+    monkeypatch.setattr(labeled.client, "extend", counted)
+    again = run_labeling(labeled.client, batch, np.random.default_rng(0), None, labeled.clock)
+    assert (again.created, again.duplicates, len(asked)) == (0, 10, 1)
+
+
 def test_explain_gives_nothing_where_even_the_best_action_misses() -> None:
     simulator = make_simulator("minigrid", ROOM.options)
     observed = simulator.reset(1)
@@ -312,6 +414,47 @@ def _measure(monkeypatch: pytest.MonkeyPatch, loop: Loop, sizes: list[int]) -> N
         return label(client, request)
 
     monkeypatch.setattr(Client, "label", measured)
+
+
+def _spoil(monkeypatch: pytest.MonkeyPatch, chosen: set[tuple[str, int]]) -> None:
+    """The chosen segments are answered with an action that the project does not have."""
+    request = delivery.Delivery._request
+
+    def spoilt(self: delivery.Delivery, answers: Any) -> LabelsRequest:
+        asked = request(self, answers)
+        changed = {"actions": [99], "action_sets": None}
+        items = [
+            item.model_copy(update=changed) if (item.trajectory, item.start) in chosen else item for item in asked.items
+        ]
+        return asked.model_copy(update={"items": items})
+
+    monkeypatch.setattr(delivery.Delivery, "_request", spoilt)
+
+
+def _end_episodes(monkeypatch: pytest.MonkeyPatch, batch: Acquisition, rank: int, after: int) -> None:
+    """The episode that this item explores in is over after so many steps."""
+    explore = labeling._explore
+
+    def cut(client: Client, project: Any, simulator: Simulator, item: AcquisitionItem, actions: Any) -> Any:
+        if item.rank == rank:
+            simulator = Cut(simulator, after)
+        return explore(client, project, simulator, item, actions)
+
+    monkeypatch.setattr(labeling, "_explore", cut)
+
+
+class Cut:
+    """A simulator whose episode ends after so many steps."""
+
+    def __init__(self, simulator: Simulator, after: int) -> None:
+        self._simulator, self._left = simulator, after
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._simulator, name)
+
+    def step(self, action: Any) -> Any:
+        self._left -= 1
+        return self._simulator.step(action)._replace(truncated=self._left <= 0)
 
 
 def _bend(monkeypatch: pytest.MonkeyPatch, loop: Loop, chosen: Callable[[tuple[str, int]], bool]) -> None:

@@ -1,6 +1,7 @@
 """Training inside a round is cut anywhere, goes on in another worker, and ends with the same bits."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -232,12 +233,51 @@ def ask_for_selection(loop: Loop) -> None:
 
 
 def test_a_round_lets_scoring_go_first(labeled: Loop, slices: Slices, undisturbed: dict[str, str]) -> None:
+    always_keep(labeled)
     asked = labeled.client.start_round(labeled.project.id)
     slices.after = {6: lambda: ask_for_selection(labeled)}
     run_next(labeled.worker)
     assert (job_of(labeled).state, job_of(labeled).error) == ("queued", None)
     labeled.drain()
     assert slices.seen == whole("inverse_dynamics") + whole("world_model")
+    assert weights(labeled, asked) == base(undisturbed)
+
+
+def test_a_round_has_worked_for_as_long_as_a_checkpoint_takes_before_it_lets_scoring_go_first(
+    labeled: Loop, slices: Slices
+) -> None:
+    """However many scorings keep coming, no attempt ends without having brought the round further."""
+    asked = labeled.client.start_round(labeled.project.id)
+    slices.after = {number: lambda: ask_for_selection(labeled) for number in (1, 2, 3)}
+    run_next(labeled.worker)
+    assert job_of(labeled).state == "done"
+    assert len(slices.seen) == 2 * STEPS // SLICE
+    labeled.drain()
+    assert labeled.client.round(asked.id).status == "current"
+
+
+@pytest.mark.parametrize("other", ["network", "data"])
+def test_a_checkpoint_of_another_network_or_of_other_data_starts_the_stage_anew(
+    labeled: Loop, slices: Slices, undisturbed: dict[str, str], other: str
+) -> None:
+    """As after an upgrade between two attempts: what cannot be loaded shall not fail every attempt."""
+    asked = labeled.client.start_round(labeled.project.id)
+    slices.after = {6: labeled.worker.stopping.set}
+    run_next(labeled.worker)
+    kept = row_of(labeled).checkpoint_sha256
+    assert kept is not None
+    state = TrainingState.from_bytes(labeled.blobs.get("checkpoints", kept))
+    if other == "network":
+        name = next(name for name in state.tensors if name.startswith("model.") and state.tensors[name].dim() == 2)
+        changed = {name: state.tensors[name][:-1].clone()}
+    else:
+        changed = {"order": state.tensors["order"][:-7].clone()}
+    foreign = replace(state, tensors={**state.tensors, **changed})
+    stored = labeled.blobs.put("checkpoints", foreign.to_bytes())
+    labeled.set_row("job", job_of(labeled).id, checkpoint_sha256=stored)
+    labeled.drain(labeled.another_worker())
+    assert slices.seen[6:] == whole("world_model")
+    assert resumptions(labeled) == []
     assert weights(labeled, asked) == base(undisturbed)
 
 

@@ -9,12 +9,14 @@ import pytest
 import torch
 
 from api_schemas.rounds import Round
+from asim.errors import Conflict
 from models import checkpoints
 from models.families import GRID
 from models.training import TrainingState
 from service import jobs, reaper, registry
 from service.errors import MissingBlob
 from service.store.queries import labels as label_queries
+from service.store.queries import rows
 from service.store.tables import ModelVersionRow, ScoringRow
 from tests.workers.conftest import OpenLoop, new_project
 from tests.workers.in_process import Loop, segments_of
@@ -174,8 +176,7 @@ def test_what_a_silent_worker_writes_after_its_lease_is_refused(labeled: Loop, m
 
     def another_finishes_it() -> None:
         labeled.clock.advance(100)
-        with labeled.worker.database.write() as session:
-            reaper.reap(session, labeled.clock())
+        reaper.reap(labeled.worker.database, labeled.clock())
         labeled.clock.advance(2)
         labeled.drain(labeled.another_worker())
 
@@ -221,8 +222,7 @@ def test_a_worker_that_dies_every_time_fails_the_round(labeled: Loop, monkeypatc
         with pytest.raises(KilledError):
             run_next(labeled.worker)
         labeled.clock.advance(100)
-        with labeled.worker.database.write() as session:
-            reaper.reap(session, labeled.clock())
+        reaper.reap(labeled.worker.database, labeled.clock())
         labeled.clock.advance(100)
     failed = labeled.client.round(asked.id)
     assert failed.status == "failed"
@@ -334,6 +334,42 @@ def _fails_scoring(loop: Loop, spoil: Callable[[Any], None]) -> str:
     return str(failed.error)
 
 
+@pytest.mark.parametrize("status", ["cancelled", "failed", "superseded"])
+def test_a_round_that_ended_while_it_was_evaluated_is_not_scored(
+    labeled: Loop, monkeypatch: pytest.MonkeyPatch, status: str
+) -> None:
+    asked = start(labeled)
+    calls = interrupt(
+        monkeypatch, 1, lambda: labeled.set_row("round", asked.id, status=status), training, "model_error"
+    )
+    before = len(labeled.jobs("score_shard"))
+    labeled.drain()
+    assert len(calls) == 1
+    assert labeled.client.round(asked.id).status == status
+    assert len(labeled.jobs("score_shard")) == before
+    (job,) = labeled.jobs("train_round")
+    assert (job.state, job.result) == ("done", {"round": str(asked.id), "status": status})
+
+
+def test_a_rounds_rows_are_locked_after_its_projects(labeled: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The order of all: who had it the other way round would deadlock with an acquire or a cancellation."""
+    start(labeled)
+    locked: list[tuple[int, str]] = []
+    get = rows.get
+
+    def noted(session: Any, row: type[Any], key: object, *, lock: bool = False) -> Any:
+        if lock:
+            locked.append((id(session), row.__name__))
+        return get(session, row, key, lock=lock)
+
+    monkeypatch.setattr(rows, "get", noted)
+    run_next(labeled.worker)
+    by_session = {number: [name for each, name in locked if each == number] for number, _ in locked}
+    several = [names for names in by_session.values() if len(set(names)) > 1]
+    assert several
+    assert all(names.index("ProjectRow") < names.index("RoundRow") for names in several if "RoundRow" in names)
+
+
 def _generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
@@ -365,8 +401,20 @@ def test_attempts_are_counted_from_the_last_stored_stage(labeled: Loop) -> None:
             assert row is not None
             jobs.made_progress(session, jobs.lease_of(row))
         labeled.clock.advance(100)  # the worker says nothing more
-        with labeled.worker.database.write() as session:
-            reaper.reap(session, labeled.clock())
+        reaper.reap(labeled.worker.database, labeled.clock())
         labeled.clock.advance(100)
     labeled.drain()
     assert labeled.client.round(asked.id).status == "current"
+
+
+def test_who_cancels_a_round_by_its_training_that_is_done_is_told_which_job_is_at_work(labeled: Loop) -> None:
+    asked = start(labeled)
+    assert asked.job is not None
+    run_next(labeled.worker)
+    shard = next(job for job in labeled.client.jobs(labeled.project.id) if job.kind == "score_shard")
+    with pytest.raises(Conflict, match=rf"job {asked.job} is done; its round goes on in job {shard.id}$"):
+        labeled.client.cancel_job(asked.job)
+    labeled.client.cancel_job(shard.id)
+    assert labeled.client.round(asked.id).status == "cancelled"
+    with pytest.raises(Conflict, match="there is nothing left to cancel"):
+        labeled.client.cancel_job(asked.job)

@@ -1,16 +1,19 @@
 """Scoring: every pool segment once, by the round's own networks, and nothing queued that is taken."""
 
+import threading
 from typing import Any
 from uuid import UUID
 
 import numpy as np
 import pytest
 import torch
+from sqlalchemy import event
 
 from models.acquisition import STRATEGIES
 from models.acquisition.base import score_pool
 from service import scorings
 from service.settings import Settings
+from service.store.blobs import Blobs
 from service.store.queries import acquisitions as queries
 from service.store.queries import pool as pool_queries
 from service.store.tables import ProjectRow, QueueRow, ScoringRow
@@ -80,7 +83,7 @@ def test_scores_are_those_of_the_strategy_on_the_rounds_networks(opened: OpenLoo
     found = newest(loop, "cycle")
     with loop.worker.database.read() as session:
         project = session.get_one(ProjectRow, loop.project.id)
-        models = scoring.load_models(session, loop.blobs, project, found.round_id)
+        models = scoring.load_models(loop.worker.database, loop.blobs, project, found.round_id)
         windows = data.windows_of(session, project, pool_queries.memberships(session, project.id, "pool"), None)
     batch = data.load(loop.blobs, windows, 1)
     direct = score_pool(STRATEGIES["cycle"], models, batch, torch.Generator())
@@ -235,6 +238,40 @@ def test_longer_segments_are_scored_and_trained_as_wholes(empty: Loop) -> None:
     batch = empty.label(5)
     assert batch.strategy == "cycle"
     assert all(item.start % 3 == 0 and item.length == 3 for item in batch.items)
+
+
+def test_no_blob_is_read_inside_a_transaction(trained: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The store may take minutes; a database ends transactions that sit idle for half of one."""
+    trained.label(3)
+    asked = trained.client.start_round(trained.project.id)
+    held, read = Connections(trained), set[str]()
+    get = Blobs.get
+
+    def watched(blobs: Blobs, kind: str, sha256: str) -> bytes:
+        assert not held.by_the_job, f"a {kind} blob is read while a connection is held"
+        read.add(kind)
+        return get(blobs, kind, sha256)
+
+    monkeypatch.setattr(Blobs, "get", watched)
+    trained.drain()
+    assert [job.error for job in trained.client.jobs(trained.project.id) if job.error] == []
+    assert read == {"trajectories", "weights", "scores"}
+    assert trained.client.round(asked.id).status == "current"
+
+
+class Connections:
+    """Counts the worker's connections that this thread holds; the heartbeat's are its own."""
+
+    def __init__(self, loop: Loop) -> None:
+        self.by_the_job, thread = 0, threading.get_ident()
+
+        def count(change: int) -> None:
+            if threading.get_ident() == thread:
+                self.by_the_job += change
+
+        pool = loop.worker.database.engine.pool
+        event.listen(pool, "checkout", lambda *_: count(1))
+        event.listen(pool, "checkin", lambda *_: count(-1))
 
 
 def test_limits_come_from_the_settings() -> None:

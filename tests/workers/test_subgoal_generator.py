@@ -1,5 +1,6 @@
 """The subgoal generator's job: action-free, always behind other work, and no step of it is lost or done differently."""
 
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,7 @@ def test_its_weights_do_not_depend_on_the_labels(opened: OpenLoop, labeled_folde
 
 
 def test_it_gives_way_and_ends_with_the_same_bits(waiting: Loop, slices: Slices, undisturbed: dict[str, str]) -> None:
+    waiting.worker = waiting.another_worker(waiting.settings.model_copy(update={"checkpoint_seconds": 1e-9}))
     slices.after = {2: lambda: waiting.ask_for_queue("vanilla_cycle")}
     run_next(waiting.worker)
     job = subgoal_job(waiting)
@@ -136,6 +138,40 @@ def test_a_pool_that_grows_meanwhile_changes_nothing(
     assert subgoal_job(waiting).state == "done"
     assert {batch.size for batch in slices.batches} == {600}
     assert weights(waiting) == undisturbed["subgoal_generator"]
+
+
+@pytest.mark.parametrize("off", [-3600.0, 3600.0])
+def test_its_pool_does_not_depend_on_the_clocks_of_the_machines(
+    waiting: Loop, slices: Slices, undisturbed: dict[str, str], off: float
+) -> None:
+    """Members and job were written by machines whose clocks are an hour apart."""
+    waiting.clock.advance(off)
+    waiting.collect(300, seed=77, split="pool")  # runs in front of the generator, whose job is queued already
+    assert subgoal_job(waiting).state == "done"
+    assert {batch.size for batch in slices.batches} == {600}
+    assert weights(waiting) == undisturbed["subgoal_generator"]
+
+
+@pytest.mark.parametrize("off", [-3600.0, 3600.0])
+def test_an_attempt_that_ended_before_its_job_was_done_is_not_repeated(
+    trained: Loop, slices: Slices, off: float
+) -> None:
+    before = weights(trained)
+    (model,) = (model for model in trained.client.models(trained.project.id) if model.kind == "subgoal_generator")
+    trained.set_row("model_version", model.id, created_at=model.created_at + timedelta(seconds=off))
+    trained.requeue(subgoal_job(trained).id)
+    trained.drain()
+    assert slices.steps == []
+    assert subgoal_job(trained).result == {"model": str(model.id)}
+    assert weights(trained) == before
+
+
+def test_an_older_jobs_payload_means_the_whole_pool(waiting: Loop, slices: Slices) -> None:
+    older = {"kind": "train_subgoal_generator", "project": str(waiting.project.id)}
+    waiting.set_row("job", subgoal_job(waiting).id, payload=older)
+    waiting.drain()
+    assert {batch.size for batch in slices.batches} == {600}
+    assert subgoal_job(waiting).state == "done"
 
 
 def test_it_follows_the_growth_of_the_pool_and_not_the_labels(trained: Loop) -> None:

@@ -5,10 +5,9 @@ from datetime import datetime
 from typing import NamedTuple
 from uuid import UUID
 
-from sqlalchemy import and_, delete, func, or_, select, tuple_, update
+from sqlalchemy import ColumnElement, and_, delete, func, or_, select, text, tuple_, update
 from sqlalchemy.orm import Session
 
-from service.store.queries.labels import labels_of
 from service.store.queries.pool import live_claim
 from service.store.queries.segments import Segment, among, parts
 from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, LabelRow, QueueRow, ScoringRow, ShardRow
@@ -34,6 +33,19 @@ def free_queue(
 
     lock: pass over the rows that another acquisition reads at this moment (PostgreSQL; SQLite has one writer anyway).
     """
+    statement = select(QueueRow).where(*_free(scoring, now)).order_by(QueueRow.rank).limit(count)
+    return session.scalars(statement.with_for_update(of=QueueRow, skip_locked=True) if lock else statement).all()
+
+
+def still_free(session: Session, scoring: ScoringRow, rows: Sequence[QueueRow], now: datetime) -> set[int]:
+    """Ranks of the queue between the first and the last of these rows, in order, whose segments are free now."""
+    if not rows:
+        return set()
+    between = QueueRow.rank.between(rows[0].rank, rows[-1].rank)
+    return set(session.scalars(select(QueueRow.rank).where(*_free(scoring, now), between)))
+
+
+def _free(scoring: ScoringRow, now: datetime) -> tuple[ColumnElement[bool], ...]:
     label = select(LabelRow.id).where(
         LabelRow.project_id == QueueRow.project_id,
         LabelRow.trajectory_id == QueueRow.trajectory_id,
@@ -47,16 +59,7 @@ def free_queue(
     )
     awake = or_(QueueRow.leased_until.is_(None), QueueRow.leased_until <= now)
     # Not outer joins: without statistics PostgreSQL joins them by the claims' expiry, every claim to every row.
-    statement = select(QueueRow).where(QueueRow.scoring_id == scoring.id, awake, ~label.exists(), ~claim.exists())
-    statement = statement.order_by(QueueRow.rank).limit(count)
-    return session.scalars(statement.with_for_update(of=QueueRow, skip_locked=True) if lock else statement).all()
-
-
-def taken_among(session: Session, project_id: UUID, segments: Sequence[Segment], now: datetime) -> set[Segment]:
-    """Those of the segments that are labeled or under a live lease."""
-    labels = labels_of(session, project_id, segments)
-    claims = claims_on(session, project_id, segments)
-    return set(labels) | {segment for segment, claim in claims.items() if claim.expires_at > now}
+    return QueueRow.scoring_id == scoring.id, awake, ~label.exists(), ~claim.exists()
 
 
 def take_claims(session: Session, claims: Sequence[ClaimRow]) -> None:
@@ -91,12 +94,6 @@ def drop_claims(session: Session, project_id: UUID, segments: Sequence[Segment])
         session.execute(gone.execution_options(synchronize_session=False))
 
 
-def reserved(session: Session, project_id: UUID, now: datetime) -> int:
-    """Labels that live leases on the pool, and on explorations, may still bring."""
-    where = (ClaimRow.project_id == project_id, live_claim(now), ClaimRow.purpose != "held_out")
-    return session.scalar(select(func.count()).where(*where)) or 0
-
-
 def newly_expired(session: Session, now: datetime, limit: int) -> Sequence[AcquisitionRow]:
     """Leases that have ended and are not noted as expired; those that somebody works on at this moment come later."""
     where = (AcquisitionRow.status == "leased", AcquisitionRow.lease_expires_at <= now)
@@ -118,15 +115,10 @@ def extend_claims(session: Session, acquisition_id: UUID, token: int, expires_at
 
 def items_with_labels(session: Session, acquisition_id: UUID) -> Sequence[tuple[AcquisitionItemRow, UUID | None]]:
     """The items of a batch by rank, each with the id of its segment's label in this acquisition's project, if any."""
-    label = and_(
-        LabelRow.project_id == AcquisitionRow.project_id,
-        LabelRow.trajectory_id == AcquisitionItemRow.trajectory_id,
-        LabelRow.start == AcquisitionItemRow.start,
-    )
     statement = (
         select(AcquisitionItemRow, LabelRow.id)
         .join(AcquisitionRow, AcquisitionRow.id == AcquisitionItemRow.acquisition_id)
-        .outerjoin(LabelRow, label)
+        .outerjoin(LabelRow, _label_of_item())
         .where(AcquisitionItemRow.acquisition_id == acquisition_id)
         .order_by(AcquisitionItemRow.rank)
     )
@@ -135,12 +127,19 @@ def items_with_labels(session: Session, acquisition_id: UUID) -> Sequence[tuple[
 
 def has_open_items(session: Session, row: AcquisitionRow) -> bool:
     """True where an item of the batch has no label, an exploration no answer."""
-    if row.mode == "explore":
-        item = select(AcquisitionItemRow.rank).where(
-            AcquisitionItemRow.acquisition_id == row.id, AcquisitionItemRow.answer.is_(None)
-        )
-        return session.scalar(item.limit(1)) is not None
-    return any(label is None for _, label in items_with_labels(session, row.id))
+    label = select(LabelRow.id).where(_label_of_item()).exists()
+    unanswered = AcquisitionItemRow.answer.is_(None) if row.mode == "explore" else ~label
+    items = select(AcquisitionItemRow.rank).join(AcquisitionRow, AcquisitionRow.id == AcquisitionItemRow.acquisition_id)
+    open_one = items.where(AcquisitionItemRow.acquisition_id == row.id, unanswered).limit(1)
+    return session.scalar(open_one) is not None
+
+
+def _label_of_item() -> ColumnElement[bool]:
+    return and_(
+        LabelRow.project_id == AcquisitionRow.project_id,
+        LabelRow.trajectory_id == AcquisitionItemRow.trajectory_id,
+        LabelRow.start == AcquisitionItemRow.start,
+    )
 
 
 def drop_from_queues(session: Session, project_id: UUID, segments: Sequence[Segment]) -> None:
@@ -172,6 +171,12 @@ def replace_queue(session: Session, scoring: ScoringRow, rows: Sequence[QueueRow
     )
     session.execute(delete(QueueRow).where(or_(QueueRow.scoring_id == scoring.id, QueueRow.scoring_id.in_(older))))
     session.add_all(rows)
+
+
+def note_sizes(session: Session) -> None:
+    """Have PostgreSQL count the queue's rows: until it does so by itself it sorts the whole queue to find its front."""
+    if session.get_bind().dialect.name == "postgresql":
+        session.execute(text("ANALYZE queue"))
 
 
 def shards(session: Session, scoring_id: UUID) -> Sequence[ShardRow]:

@@ -1,15 +1,21 @@
 """Events."""
 
-from datetime import datetime, timedelta
+from sqlalchemy import BigInteger, ColumnElement, case, func, literal, select, update
+from sqlalchemy.orm import Session
 
-from sqlalchemy import ColumnElement, or_
+from service.store.horizon import CurrentTransaction, OldestOpenTransaction
+from service.store.tables import EventEpochRow, EventRow
 
-from service.store.horizon import OldestOpenTransaction
-from service.store.tables import EventRow
-
-ALWAYS_SETTLED = timedelta(hours=1)  # no transaction is open for so long; and a restored database numbers them anew
+ORDER = (EventRow.transaction, EventRow.id)  # in which they can be followed
 
 
-def settled(now: datetime) -> ColumnElement[bool]:
-    """No event with a smaller id can still be committed: a reader that goes on behind this one misses nothing."""
-    return or_(EventRow.transaction < OldestOpenTransaction(), EventRow.created_at < now - ALWAYS_SETTLED)
+def settled() -> ColumnElement[bool]:
+    """No event that comes before it in ORDER can still be committed: a reader who goes on behind it misses nothing."""
+    return EventRow.transaction < OldestOpenTransaction()
+
+
+def keep_order(session: Session) -> None:
+    """Have what is written from now on come after all that is there, also where another server wrote that."""
+    newest = session.scalar(select(func.max(EventRow.transaction))) or 0
+    ahead = literal(newest, BigInteger()) - CurrentTransaction()
+    session.execute(update(EventEpochRow).values(added=EventEpochRow.added + case((ahead > 0, ahead), else_=0)))

@@ -36,10 +36,10 @@ def unfinished(session: Session, subject_id: UUID, kind: str | None = None) -> J
     return session.scalar(statement.order_by(JobRow.created_at).limit(1))
 
 
-def silent(session: Session, now: datetime) -> Sequence[JobRow]:
-    """Running jobs whose lease has ended."""
+def silent(session: Session, now: datetime) -> JobRow | None:
+    """A running job whose lease has ended, if there is one that nobody else has in hand."""
     statement = select(JobRow).where(JobRow.state == "running", JobRow.lease_until <= now)
-    return session.scalars(statement.with_for_update(skip_locked=True)).all()
+    return session.scalar(statement.order_by(JobRow.lease_until).limit(1).with_for_update(skip_locked=True))
 
 
 def unsent(session: Session, now: datetime, limit: int) -> Sequence[JobRow]:
@@ -48,9 +48,9 @@ def unsent(session: Session, now: datetime, limit: int) -> Sequence[JobRow]:
     return session.scalars(statement.order_by(JobRow.priority.desc(), JobRow.created_at).limit(limit)).all()
 
 
-def unclaimed(session: Session, now: datetime, sent_before: datetime, limit: int) -> Sequence[JobRow]:
-    """Jobs that may run, were given to a carrier before then, and wait still."""
-    statement = select(JobRow).where(JobRow.state == "queued", _ready(now), JobRow.sent_at <= sent_before)
+def unclaimed(session: Session, queue: str, now: datetime, sent_before: datetime, limit: int) -> Sequence[JobRow]:
+    """Jobs of a queue that may run, were given to a carrier before then, and wait still; those sent first go first."""
+    statement = select(JobRow).where(_waiting([queue], now), JobRow.sent_at <= sent_before)
     return session.scalars(statement.order_by(JobRow.sent_at, JobRow.id).limit(limit)).all()
 
 
@@ -91,6 +91,12 @@ def queues_at_work(session: Session, now: datetime) -> set[str]:
     statement = select(WorkerRow.queues).join(JobRow, JobRow.owner == WorkerRow.owner)
     statement = statement.where(JobRow.state == "running", JobRow.lease_until > now, JobRow.kind != "canary")
     return {str(queue) for queues in session.scalars(statement) for queue in queues}
+
+
+def done_since(session: Session, queue: str, since: datetime) -> bool:
+    """True where a job of the queue was done then or later."""
+    statement = select(JobRow.id).where(JobRow.state == "done", JobRow.queue == queue, JobRow.finished_at >= since)
+    return session.scalar(statement.limit(1)) is not None
 
 
 def held_by_process(session: Session, host: str, pids: Sequence[int], now: datetime) -> bool:

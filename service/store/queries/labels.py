@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 from uuid import UUID
 
 import sqlalchemy
-from sqlalchemy import JSON, func, select
+from sqlalchemy import JSON, Connection, func, select
+from sqlalchemy.engine.interfaces import DBAPIModule
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from service.store.queries.segments import Segment, looked_up, parts
@@ -20,7 +22,7 @@ class StoredLabel(NamedTuple):
     """As much of a label as tells whether another is the same: its content, and how to show it."""
 
     content_sha256: str
-    shown: object
+    shown: Sequence[object]
 
 
 def labels_of(session: Session, project_id: UUID, segments: Sequence[Segment]) -> dict[Segment, StoredLabel]:
@@ -37,17 +39,24 @@ def labels_of(session: Session, project_id: UUID, segments: Sequence[Segment]) -
 
 
 def insert(session: Session, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write new labels, by column; on PostgreSQL by COPY, a quarter of the time of an INSERT of as many rows."""
+    """Write new labels, by column; on PostgreSQL by COPY, a quarter of the time of an INSERT of as many rows.
+
+    Raises what any statement raises, SQLAlchemy's DBAPIError.
+    """
     connection = session.connection()
     if connection.dialect.driver != "psycopg":
         session.execute(sqlalchemy.insert(LabelRow), [dict(row) for row in rows])
         return
     columns = [column.key for column in LabelRow.__table__.columns]
     jsons = {column.key for column in LabelRow.__table__.columns if isinstance(column.type, JSON)}
+    statement = f"COPY label ({', '.join(columns)}) FROM STDIN"
     driver = cast("psycopg.Connection", connection.connection.driver_connection)
-    with driver.cursor() as cursor, cursor.copy(f"COPY label ({', '.join(columns)}) FROM STDIN") as copy:
-        for row in rows:
-            copy.write_row([_json(row[name]) if name in jsons else row[name] for name in columns])
+    try:
+        with driver.cursor() as cursor, cursor.copy(statement) as copy:
+            for row in rows:
+                copy.write_row([_json(row[name]) if name in jsons else row[name] for name in columns])
+    except connection.dialect.loaded_dbapi.Error as error:
+        raise _as_any_other(connection, statement, error) from error
 
 
 def labels_up_to(session: Session, project_id: UUID, split: str, watermark: int) -> Sequence[LabelRow]:
@@ -78,3 +87,17 @@ def labeled_by_trajectory(session: Session, project_id: UUID, trajectories: Sequ
 
 def _json(value: object) -> str | None:
     return None if value is None else json.dumps(value)
+
+
+def _as_any_other(connection: Connection, statement: str, error: DBAPIModule.Error) -> BaseException:
+    """The driver's own error as SQLAlchemy shows it for statements that it sends itself; a lost connection is let go.
+
+    The base class is named because `instance` leaves anything else as it is.
+    """
+    lost = connection.dialect.is_disconnect(error, connection.connection.dbapi_connection, None)
+    wrapped = DBAPIError.instance(
+        statement, None, error, connection.dialect.loaded_dbapi.Error, connection_invalidated=lost
+    )
+    if lost:
+        connection.invalidate(error)
+    return wrapped

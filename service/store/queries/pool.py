@@ -7,10 +7,10 @@ from typing import NamedTuple
 from uuid import UUID
 
 from sqlalchemy import ColumnElement, and_, func, select
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from api_schemas.base import Split
+from service.store.queries.inserting import insert
 from service.store.tables import ClaimRow, LabelRow, MembershipRow, ProjectRow, TrajectoryRow
 
 
@@ -22,10 +22,25 @@ class Member:
     segments: int
 
 
-def leased(session: Session, project_id: UUID, split: str, now: datetime) -> int:
-    """Segments of a split under a live lease."""
-    where = (live_claim(now), ClaimRow.project_id == project_id, ClaimRow.purpose == split)
-    return session.scalar(select(func.count()).where(*where)) or 0
+class Leased(NamedTuple):
+    """What is under a live lease: segments of the two splits, explorations."""
+
+    pool: int = 0
+    held_out: int = 0
+    explore: int = 0
+
+    @property
+    def reserved(self) -> int:
+        """Labels of the budget that may still come."""
+        return self.pool + self.explore
+
+
+def leased(session: Session, project_id: UUID, now: datetime) -> Leased:
+    """What of a project is under a live lease."""
+    where = (live_claim(now), ClaimRow.project_id == project_id)
+    counts = session.execute(select(ClaimRow.purpose, func.count()).where(*where).group_by(ClaimRow.purpose))
+    by_purpose: dict[str, int] = dict(iter(counts))
+    return Leased(**by_purpose)
 
 
 def live_claim(now: datetime) -> ColumnElement[bool]:
@@ -62,6 +77,14 @@ def members(session: Session, project_id: UUID, split: str, *, with_provenance: 
     if with_provenance:
         statement = statement.where(MembershipRow.provenance_sha256.is_not(None))
     return [Member(name, segments) for name, segments in session.execute(statement.order_by(MembershipRow.id))]
+
+
+def sizes(session: Session, project_id: UUID, split: str) -> list[tuple[int, int]]:
+    """(membership id, segments) of a split in the order they came."""
+    statement = select(MembershipRow.id, MembershipRow.segments).where(
+        MembershipRow.project_id == project_id, MembershipRow.split == split
+    )
+    return [(member, segments) for member, segments in session.execute(statement.order_by(MembershipRow.id))]
 
 
 class Membership(NamedTuple):
@@ -104,10 +127,9 @@ def keep_contents(session: Session, rows: Sequence[TrajectoryRow]) -> None:
     """Write rows of trajectories that may be there; another project may be writing the same ones at this moment."""
     if not rows:
         return
-    insert = postgresql.insert if session.get_bind().dialect.name == "postgresql" else sqlite.insert
     columns = [column.key for column in TrajectoryRow.__table__.columns]
     values = [{column: getattr(row, column) for column in columns} for row in rows]
-    session.execute(insert(TrajectoryRow).on_conflict_do_nothing(), values)
+    session.execute(insert(session, TrajectoryRow).on_conflict_do_nothing(), values)
 
 
 def projects_in_order(session: Session) -> Sequence[ProjectRow]:
