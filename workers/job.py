@@ -48,6 +48,7 @@ class RunningJob:
         self._progress, self._message = 0.0, ""
         self._lost = threading.Event()
         self._began = self._heard = time.monotonic()
+        self._ready: float | None = None
         self._told_of_silence = False
 
     @contextmanager
@@ -79,15 +80,19 @@ class RunningJob:
         if self.worker.stopping.is_set():
             raise GaveWay(f"worker {self.worker.owner} stops")
 
+    def prepared(self) -> None:
+        """All that it works on is loaded: from here on it brings its subject further. The first call counts."""
+        self._ready = self._ready or time.monotonic()
+
     def should_give_way(self) -> bool:
         """True where the process ends or a job of higher priority waits for this worker.
 
-        An attempt works for as long as a checkpoint takes before it gives way to others: however many of them keep
-        coming, each attempt brings the job further.
+        Before it gives way to others an attempt works for as long as it took to get ready, so that however many of them
+        keep coming at most half of its time goes to loading.
         """
         if self.worker.stopping.is_set():
             return True
-        if time.monotonic() - self._began < self.worker.settings.checkpoint_seconds:
+        if self._ready is None or time.monotonic() - self._ready < self._ready - self._began:
             return False
         with self.worker.database.read() as session:
             return queries.higher_waiting(session, self.worker.queues, self.lease.priority, self.now())

@@ -41,6 +41,7 @@ class Stage:
         state = self._resumed(network, batch, config) or begin(network, config, generator)
         steps, loss, saved = FIRST_STEPS, [0.0], time.monotonic()
         self._stored = state.step
+        self._job.prepared()
         while state.step < config.steps:
             started = time.monotonic()
             if started - saved >= self._job.worker.settings.checkpoint_seconds:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from uuid import UUID, uuid4
 
 import pytest
@@ -465,17 +466,35 @@ def test_a_canary_that_failed_is_planted_again(served: Served) -> None:
 def test_no_job_gives_way_to_a_canary(served: Served) -> None:
     project = served.project()
     enqueue(served, project, generator(project))
-    worker = served.worker("train")
-    early = RunningJob(worker, claimed(served))
-    at_once = worker.settings.model_copy(update={"checkpoint_seconds": 1e-9})
-    running = RunningJob(replace(worker, settings=at_once), early.lease)
+    running = RunningJob(served.worker("train"), claimed(served))
+    running.prepared()
+    time.sleep(0.01)
     plant(served)
     assert not running.should_give_way()
     enqueue(served, project, TrainRound(round=uuid4(), strategy="cycle"))
     assert running.should_give_way()
-    assert not early.should_give_way()  # its attempt has not brought it any further yet
-    worker.stopping.set()
-    assert early.should_give_way()
+
+
+def test_a_job_works_for_as_long_as_it_took_to_get_ready_before_it_gives_way(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, seconds = served.project(), [100.0]
+    monkeypatch.setattr("workers.job.time", SimpleNamespace(monotonic=lambda: seconds[0]))
+    enqueue(served, project, generator(project))
+    worker = served.worker("train")
+    running = RunningJob(worker, claimed(served))
+    enqueue(served, project, TrainRound(round=uuid4(), strategy="cycle"))
+    seconds[0] += 30
+    assert not running.should_give_way()  # it is still loading
+    running.prepared()
+    seconds[0] += 29
+    running.prepared()  # by the next stage
+    assert not running.should_give_way()
+    seconds[0] += 1
+    assert running.should_give_way()
+    seconds[0] -= 30
+    worker.stopping.set()  # the process ends: that waits for nothing
+    assert running.should_give_way()
     worker.stopping.clear()
 
 

@@ -109,7 +109,7 @@ def _cursor(*values: object) -> str:
         _cursor(),
         _cursor("x"),
         _cursor("x", "y"),
-        _cursor(1, 2),
+        _cursor(1, "x"),
         _cursor(None),
         _cursor([1]),
         _cursor({}, {}),

@@ -233,8 +233,7 @@ def test_a_short_batch_does_not_extend_its_lease(labeled: Loop) -> None:
 
 
 def test_a_lease_that_is_lost_meanwhile_is_said_so_and_what_it_still_covers_is_stored(labeled: Loop) -> None:
-    free = labeled.project.counts.unlabeled
-    batch = labeled.acquire(free, "random", lease_seconds=60)
+    batch = labeled.acquire(40, "random", lease_seconds=60)
     taken = []
 
     def overslept(done: int, of: int) -> None:
@@ -243,11 +242,11 @@ def test_a_lease_that_is_lost_meanwhile_is_said_so_and_what_it_still_covers_is_s
             taken.append(labeled.acquire(3, "random"))
 
     before = labeled.project.counts.labeled
-    with pytest.raises(LeaseLost, match=rf"lost while its {free} items were answered: acquisition {batch.id}: it does"):
+    with pytest.raises(LeaseLost, match=rf"lost while its 40 items were answered: acquisition {batch.id}: it does"):
         run_labeling(labeled.client, batch, np.random.default_rng(0), overslept, labeled.clock)
-    assert labeled.project.counts.labeled == before + free - 3
+    assert labeled.project.counts.labeled == before + 37
     run_labeling(labeled.client, taken[0], np.random.default_rng(0))
-    assert labeled.project.counts.labeled == before + free
+    assert labeled.project.counts.labeled == before + 40
 
 
 def test_a_lease_that_was_given_back_ends_the_labeling_at_once(labeled: Loop) -> None:
@@ -285,13 +284,13 @@ def test_a_label_that_the_service_finds_fault_with_is_named_and_the_others_are_s
 def test_a_service_that_finds_fault_with_every_label_is_not_asked_about_each(
     labeled: Loop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    batch = labeled.acquire(300, "random")
+    batch = labeled.acquire(100, "random")
     _spoil(monkeypatch, {(item.trajectory, item.start) for item in batch.items})
     sizes: list[int] = []
     _measure(monkeypatch, labeled, sizes)
     with pytest.raises(Invalid):
         run_labeling(labeled.client, batch, np.random.default_rng(0))
-    assert len(sizes) < 60  # of 599 that it would take to have each stand alone
+    assert len(sizes) < 60  # of 199 that it would take to have each stand alone
     assert labeled.client.acquisition(batch.id).status == "released"
 
 
@@ -314,7 +313,8 @@ def test_an_exploration_whose_episode_ends_early_is_given_back_and_the_others_ar
 def test_a_lease_that_holds_nothing_any_more_is_found_out_by_one_question(
     labeled: Loop, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    batch = labeled.acquire(labeled.project.counts.unlabeled, "random", lease_seconds=60)
+    monkeypatch.setattr(delivery, "BATCH", 20)
+    batch = labeled.acquire(50, "random", lease_seconds=60)
 
     def overslept(done: int, of: int) -> None:
         if done == of and how == "released":

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -232,8 +233,10 @@ def ask_for_selection(loop: Loop) -> None:
         jobs.enqueue(session, scoring.project_id, payload, scoring.id, loop.clock())
 
 
-def test_a_round_lets_scoring_go_first(labeled: Loop, slices: Slices, undisturbed: dict[str, str]) -> None:
-    always_keep(labeled)
+def test_a_round_lets_scoring_go_first(
+    labeled: Loop, slices: Slices, undisturbed: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.job.time", SimpleNamespace(monotonic=lambda: 0.0))  # loading took no time
     asked = labeled.client.start_round(labeled.project.id)
     slices.after = {6: lambda: ask_for_selection(labeled)}
     run_next(labeled.worker)
@@ -241,19 +244,6 @@ def test_a_round_lets_scoring_go_first(labeled: Loop, slices: Slices, undisturbe
     labeled.drain()
     assert slices.seen == whole("inverse_dynamics") + whole("world_model")
     assert weights(labeled, asked) == base(undisturbed)
-
-
-def test_a_round_has_worked_for_as_long_as_a_checkpoint_takes_before_it_lets_scoring_go_first(
-    labeled: Loop, slices: Slices
-) -> None:
-    """However many scorings keep coming, no attempt ends without having brought the round further."""
-    asked = labeled.client.start_round(labeled.project.id)
-    slices.after = {number: lambda: ask_for_selection(labeled) for number in (1, 2, 3)}
-    run_next(labeled.worker)
-    assert job_of(labeled).state == "done"
-    assert len(slices.seen) == 2 * STEPS // SLICE
-    labeled.drain()
-    assert labeled.client.round(asked.id).status == "current"
 
 
 @pytest.mark.parametrize("other", ["network", "data"])
