@@ -1,7 +1,7 @@
 """Acquisitions: batches given out under a lease: segments of a ranked queue, held-out segments, or explorations."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from uuid import UUID
 
@@ -16,26 +16,29 @@ from service.draws import Candidate
 from service.errors import BudgetExhausted, NothingToExplore, PoolExhausted, UnknownStrategy
 from service.store.queries import acquisitions as queries
 from service.store.queries import pool as pool_queries
+from service.store.queries.acquisitions import Queued
 from service.store.queries.pool import Leased
 from service.store.tables import (
     AcquisitionItemRow,
     AcquisitionRow,
-    ClaimRow,
     JobRow,
     ProjectRow,
-    QueueRow,
     ScoringRow,
 )
 
 
 @dataclass(frozen=True)
 class Draw:
-    """What a batch is made of, who ranked it, and why it is smaller than was asked for."""
+    """What a batch is made of, who ranked it, and why it is smaller than was asked for.
+
+    scoring: of the queue that it is from, if any; locked: the ranks there of rows that this transaction has locked.
+    """
 
     strategy: str
     candidates: Sequence[Candidate]
-    round_id: UUID | None = None
     reason: str | None = None
+    scoring: ScoringRow | None = None
+    locked: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
@@ -70,22 +73,24 @@ def acquire(session: Session, request: AcquireRequest, clock: Clock, limits: sco
         drawn = _draw_ranked(session, project, requested, room, first, now, limits)
     if isinstance(drawn, JobRow):
         return drawn
-    row, items = _lease(session, project, request, requested, drawn, now)
-    budget = projects.budget_of(project, _with(leased, row, len(items)))
-    return _told(project, row, [(item, None) for item in items], budget, now, with_token=True)
+    row = _lease(session, project, request, requested, drawn, now)
+    budget = projects.budget_of(project, _with(leased, row, len(drawn.candidates)))
+    items = [_item(project, rank, candidate) for rank, candidate in enumerate(drawn.candidates)]
+    return _told(project, row, items, budget, now, with_token=True)
 
 
 def describe(session: Session, row: AcquisitionRow, now: datetime, *, with_token: bool) -> Acquisition:
     """The acquisition as the API shows it; the token only to the one who has just acquired it."""
     project = projects.find(session, row.project_id)
     budget = projects.budget_of(project, pool_queries.leased(session, project.id, now))
-    return _told(project, row, queries.items_with_labels(session, row.id), budget, now, with_token=with_token)
+    items = [_kept_item(project, item, label) for item, label in queries.items_with_labels(session, row.id)]
+    return _told(project, row, items, budget, now, with_token=with_token)
 
 
 def _told(
     project: ProjectRow,
     row: AcquisitionRow,
-    items: Sequence[tuple[AcquisitionItemRow, UUID | None]],
+    items: list[AcquisitionItem],
     budget: Budget,
     now: datetime,
     *,
@@ -104,7 +109,7 @@ def _told(
         round=row.round_id,
         status="expired" if expired else row.status,  # type: ignore[arg-type]  # pydantic checks the literal
         token=row.token if with_token else None,
-        items=[_shown(project, item, label) for item, label in items],
+        items=items,
         budget=budget,
         **fields,
     )
@@ -118,7 +123,7 @@ def _known(strategy: str) -> str:
 
 def _front_of_queue(
     session: Session, project: ProjectRow, strategy: str, count: int, now: datetime
-) -> tuple[ScoringRow, Sequence[QueueRow]] | None:
+) -> tuple[ScoringRow, Sequence[Queued]] | None:
     """The first free rows of the queue that nobody else reads at this moment, where a queue is ready."""
     scoring = scorings.ready(session, project, strategy)
     return None if scoring is None else (scoring, queries.free_queue(session, scoring, count, now, lock=True))
@@ -149,7 +154,7 @@ def _draw_ranked(
     project: ProjectRow,
     requested: str,
     room: Room,
-    first: tuple[ScoringRow, Sequence[QueueRow]] | None,
+    first: tuple[ScoringRow, Sequence[Queued]] | None,
     now: datetime,
     limits: scorings.Limits,
 ) -> Draw | JobRow:
@@ -158,7 +163,7 @@ def _draw_ranked(
         free = queries.still_free(session, scoring, rows, now)
         rows = [row for row in rows if row.rank in free][: room.count]
         if len(rows) == room.count:
-            return _ranked(scoring, rows, room)
+            return replace(_ranked(scoring, rows, room), locked=[row.rank for row in rows])
     # Others were faster, or the queue is short: look again, now that nobody moves.
     found = scorings.usable(session, project, requested, now, limits)
     if isinstance(found, JobRow):
@@ -169,9 +174,9 @@ def _draw_ranked(
     return _ranked(found, rows, room)
 
 
-def _ranked(scoring: ScoringRow, rows: Sequence[QueueRow], room: Room) -> Draw:
-    candidates = [Candidate(row.trajectory_id, row.start, row.score) for row in rows]
-    return Draw(scoring.strategy, candidates, scoring.round_id, room.reason)
+def _ranked(scoring: ScoringRow, rows: Sequence[Queued], room: Room) -> Draw:
+    candidates = [Candidate(row.trajectory, row.start, row.score) for row in rows]
+    return Draw(scoring.strategy, candidates, room.reason, scoring)
 
 
 def _draw_explorations(project: ProjectRow, states: draws.States, room: Room) -> Draw:
@@ -184,7 +189,7 @@ def _draw_explorations(project: ProjectRow, states: draws.States, room: Room) ->
 
 def _lease(
     session: Session, project: ProjectRow, request: AcquireRequest, requested: str, draw: Draw, now: datetime
-) -> tuple[AcquisitionRow, list[AcquisitionItemRow]]:
+) -> AcquisitionRow:
     project.token += 1
     seconds = request.lease_seconds or projects.policy_of(project).lease_seconds
     row = AcquisitionRow(
@@ -193,7 +198,7 @@ def _lease(
         purpose=request.purpose,
         strategy=draw.strategy,
         requested_strategy=requested,
-        round_id=draw.round_id,
+        round_id=draw.scoring.round_id if draw.scoring else None,
         status="leased",
         reason=draw.reason,
         labeler=request.labeler,
@@ -203,15 +208,21 @@ def _lease(
     )
     session.add(row)
     session.flush()
-    items = [_item(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)]
-    session.add_all(items)
-    queries.take_claims(session, [_claim(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
-    if row.mode == "pool" and row.purpose == "pool":
-        segments = [(candidate.trajectory, candidate.start) for candidate in draw.candidates]
-        queries.pass_over(session, project.id, segments, row.lease_expires_at)
+    queries.add_items(session, [_item_row(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
+    queries.take_claims(session, [_claim_row(row, rank, candidate) for rank, candidate in enumerate(draw.candidates)])
+    _pass_over(session, row, draw)
     data = {"acquisition": str(row.id), "count": len(draw.candidates), "strategy": row.strategy}
     events.record(session, project.id, "lease.given", data | {"labeler": row.labeler, "mode": row.mode}, now)
-    return row, items
+    return row
+
+
+def _pass_over(session: Session, row: AcquisitionRow, draw: Draw) -> None:
+    """Spare the next one a look at the claims of these. Rows that others may hold are left alone where they do."""
+    if draw.scoring is not None and draw.locked:
+        queries.note_leased(session, draw.scoring.id, draw.locked, row.lease_expires_at)
+    elif draw.scoring is not None:
+        segments = [(candidate.trajectory, candidate.start) for candidate in draw.candidates]
+        queries.pass_over(session, row.project_id, segments, row.lease_expires_at)
 
 
 def _with(leased: Leased, row: AcquisitionRow, count: int) -> Leased:
@@ -220,40 +231,53 @@ def _with(leased: Leased, row: AcquisitionRow, count: int) -> Leased:
     return leased._replace(**{kind: getattr(leased, kind) + count})
 
 
-def _item(row: AcquisitionRow, rank: int, candidate: Candidate) -> AcquisitionItemRow:
-    return AcquisitionItemRow(
-        acquisition_id=row.id,
+def _item_row(row: AcquisitionRow, rank: int, candidate: Candidate) -> dict[str, object]:
+    return {
+        "acquisition_id": row.id,
+        "rank": rank,
+        "trajectory_id": candidate.trajectory,
+        "start": candidate.start,
+        "score": candidate.score,
+        "actions": None if candidate.actions is None else list(candidate.actions),
+    }
+
+
+def _claim_row(row: AcquisitionRow, rank: int, candidate: Candidate) -> dict[str, object]:
+    explores = row.mode == "explore"
+    return {
+        "project_id": row.project_id,
+        "trajectory_id": leases.exploration_name(row.id) if explores else candidate.trajectory,
+        "start": rank if explores else candidate.start,
+        "acquisition_id": row.id,
+        "purpose": "explore" if explores else row.purpose,
+        "token": row.token,
+        "expires_at": row.lease_expires_at,
+    }
+
+
+def _item(project: ProjectRow, rank: int, candidate: Candidate) -> AcquisitionItem:
+    """An item that has just been drawn."""
+    return AcquisitionItem(
         rank=rank,
-        trajectory_id=candidate.trajectory,
+        trajectory=candidate.trajectory,
         start=candidate.start,
+        length=project.segment_length,
         score=candidate.score,
+        labeled=False,
         actions=None if candidate.actions is None else list(candidate.actions),
     )
 
 
-def _claim(row: AcquisitionRow, rank: int, candidate: Candidate) -> ClaimRow:
-    explores = row.mode == "explore"
-    return ClaimRow(
-        project_id=row.project_id,
-        trajectory_id=leases.exploration_name(row.id) if explores else candidate.trajectory,
-        start=rank if explores else candidate.start,
-        acquisition_id=row.id,
-        purpose="explore" if explores else row.purpose,
-        token=row.token,
-        expires_at=row.lease_expires_at,
-    )
-
-
-def _shown(project: ProjectRow, item: AcquisitionItemRow, label: UUID | None) -> AcquisitionItem:
-    explores = item.actions is not None
+def _kept_item(project: ProjectRow, row: AcquisitionItemRow, label: UUID | None) -> AcquisitionItem:
+    explores = row.actions is not None
     return AcquisitionItem.model_validate(
         {
-            "rank": item.rank,
-            "trajectory": item.trajectory_id,
-            "start": item.start,
+            "rank": row.rank,
+            "trajectory": row.trajectory_id,
+            "start": row.start,
             "length": project.segment_length,
-            "score": item.score,
-            "labeled": item.answer is not None if explores else label is not None,
-            "actions": item.actions,
+            "score": row.score,
+            "labeled": row.answer is not None if explores else label is not None,
+            "actions": row.actions,
         }
     )

@@ -12,6 +12,7 @@ from service.api import acquisitions, jobs, labels, problems, projects, rounds, 
 from service.api.dependencies import Services
 from service.carrier import Relay
 from service.clock import utc_now
+from service.collector import freeze_imports
 from service.dashboard import page
 from service.log import configure_logs
 from service.settings import Settings
@@ -62,6 +63,7 @@ def open_services(settings: Settings, clock: Callable[[], datetime] = utc_now) -
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     held: Services = app.state.services
+    freeze_imports()
     relay = None if held.settings.embedded else Relay(held.database, held.settings, held.clock)
     if relay:
         relay.start()

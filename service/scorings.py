@@ -48,10 +48,11 @@ class Ranked:
 def ready(session: Session, project: ProjectRow, requested: str) -> ScoringRow | None:
     """The scoring whose queue may be read at once; None where `usable` has something to start or to wait for."""
     strategy, round_row = _ranking(session, project, requested)
-    newest = queries.newest_scoring(session, project.id, strategy, round_row.id if round_row else None)
-    if newest is None or newest.status != "ready" or (round_row is None and _outgrown(session, newest)):
+    found = queries.newest_ready(session, project.id, strategy, round_row.id if round_row else None)
+    if found is None:
         return None
-    return newest
+    newest, member = found
+    return None if round_row is None and newest.memberships < member else newest
 
 
 def usable(session: Session, project: ProjectRow, requested: str, now: datetime, limits: Limits) -> ScoringRow | JobRow:

@@ -6,7 +6,6 @@ It ends on SIGTERM and SIGINT, giving its job back, and by itself when its paren
 """
 
 import argparse
-import gc
 import signal
 import threading
 import time
@@ -16,6 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service import canary, jobs, reaper
 from service.clock import utc_now
+from service.collector import freeze_imports
 from service.log import configure_logs, get_logger
 from service.settings import Settings
 from workers.dispatch import open_worker, run_next
@@ -57,8 +57,7 @@ def _reap(worker: Worker) -> None:
 def prepare_science(settings: Settings) -> None:
     """Get a process ready to train and score.
 
-    Torch's threads are 1 by default, so that workers side by side do not fight for cores. What is imported lives as
-    long as the process, so the garbage collector need not walk through it: a fifth of a second each time.
+    Torch's threads are 1 by default, so that workers side by side do not fight for cores.
     """
     import torch
 
@@ -66,8 +65,7 @@ def prepare_science(settings: Settings) -> None:
     import workers.training  # noqa: F401  # imported now, so that freezing covers it
 
     torch.set_num_threads(settings.torch_threads)
-    gc.collect()
-    gc.freeze()
+    freeze_imports()
 
 
 def main() -> None:

@@ -86,11 +86,15 @@ def _configure_sqlite(connection: DBAPIConnection, _: ConnectionPoolEntry) -> No
 
 
 def _configure_postgresql(connection: DBAPIConnection, _: ConnectionPoolEntry) -> None:
-    """Nobody waits for ever: for a row that another holds, or because a frozen process sits on an open transaction."""
+    """Nobody waits for ever: for a row that another holds, or because a frozen process sits on an open transaction.
+
+    Nor for a compiler: on tables without statistics yet PostgreSQL takes short statements for long ones.
+    """
     autocommit = connection.autocommit
     connection.autocommit = True  # else the pool's first rollback takes the settings back
     for name, milliseconds in WAITS.items():
         connection.cursor().execute(f"SET {name} = {milliseconds}")
+    connection.cursor().execute("SET jit = off")
     connection.autocommit = autocommit
 
 

@@ -1,43 +1,80 @@
 """Scorings, their queues, and claims on segments."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import NamedTuple
 from uuid import UUID
 
-from sqlalchemy import ColumnElement, and_, delete, func, or_, select, text, tuple_, update
+from sqlalchemy import ColumnElement, Select, and_, delete, func, or_, select, text, tuple_, update
 from sqlalchemy.orm import Session
 
+from service.store.queries.inserting import insert
 from service.store.queries.pool import live_claim
 from service.store.queries.segments import Segment, among, parts
-from service.store.tables import AcquisitionItemRow, AcquisitionRow, ClaimRow, LabelRow, QueueRow, ScoringRow, ShardRow
+from service.store.tables import (
+    AcquisitionItemRow,
+    AcquisitionRow,
+    ClaimRow,
+    LabelRow,
+    MembershipRow,
+    QueueRow,
+    ScoringRow,
+    ShardRow,
+)
 
 
 def newest_scoring(
     session: Session, project_id: UUID, strategy: str, round_id: UUID | None, status: str | None = None
 ) -> ScoringRow | None:
     """The youngest scoring of a strategy under a round that has not failed, or that has this status."""
+    statement = _scorings(project_id, strategy, round_id)
+    wanted = ScoringRow.status != "failed" if status is None else ScoringRow.status == status
+    return session.scalar(statement.where(wanted).limit(1))
+
+
+def _scorings(project_id: UUID, strategy: str, round_id: UUID | None) -> Select[ScoringRow]:
+    """Youngest first."""
     statement = select(ScoringRow).where(
         ScoringRow.project_id == project_id,
         ScoringRow.strategy == strategy,
         ScoringRow.round_id == round_id if round_id else ScoringRow.round_id.is_(None),
-        ScoringRow.status != "failed" if status is None else ScoringRow.status == status,
     )
-    return session.scalar(statement.order_by(ScoringRow.created_at.desc()).limit(1))
+    return statement.order_by(ScoringRow.created_at.desc())
 
 
-def free_queue(
-    session: Session, scoring: ScoringRow, count: int, now: datetime, *, lock: bool = False
-) -> Sequence[QueueRow]:
+class Queued(NamedTuple):
+    """A ranked segment as it stands in a queue."""
+
+    rank: int
+    trajectory: str
+    start: int
+    score: float | None
+
+
+def newest_ready(
+    session: Session, project_id: UUID, strategy: str, round_id: UUID | None
+) -> tuple[ScoringRow, int] | None:
+    """The youngest scoring that has not failed, if its queue is ready, and the id of the pool's youngest member."""
+    member = select(func.max(MembershipRow.id)).where(
+        MembershipRow.project_id == project_id, MembershipRow.split == "pool"
+    )
+    statement = _scorings(project_id, strategy, round_id).where(ScoringRow.status != "failed").limit(1)
+    found = session.execute(statement.add_columns(func.coalesce(member.scalar_subquery(), 0))).first()
+    return None if found is None or found[0].status != "ready" else (found[0], found[1])
+
+
+def free_queue(session: Session, scoring: ScoringRow, count: int, now: datetime, *, lock: bool = False) -> list[Queued]:
     """The best ranked segments that are neither labeled nor under a live lease; expiry is checked here, by no sweep.
 
     lock: pass over the rows that another acquisition reads at this moment (PostgreSQL; SQLite has one writer anyway).
     """
-    statement = select(QueueRow).where(*_free(scoring, now)).order_by(QueueRow.rank).limit(count)
-    return session.scalars(statement.with_for_update(of=QueueRow, skip_locked=True) if lock else statement).all()
+    columns = (QueueRow.rank, QueueRow.trajectory_id, QueueRow.start, QueueRow.score)
+    statement = select(*columns).where(*_free(scoring, now)).order_by(QueueRow.rank).limit(count)
+    found = session.execute(statement.with_for_update(of=QueueRow, skip_locked=True) if lock else statement)
+    return [Queued(*row) for row in found]
 
 
-def still_free(session: Session, scoring: ScoringRow, rows: Sequence[QueueRow], now: datetime) -> set[int]:
+def still_free(session: Session, scoring: ScoringRow, rows: Sequence[Queued], now: datetime) -> set[int]:
     """Ranks of the queue between the first and the last of these rows, in order, whose segments are free now."""
     if not rows:
         return set()
@@ -62,10 +99,17 @@ def _free(scoring: ScoringRow, now: datetime) -> tuple[ColumnElement[bool], ...]
     return QueueRow.scoring_id == scoring.id, awake, ~label.exists(), ~claim.exists()
 
 
-def take_claims(session: Session, claims: Sequence[ClaimRow]) -> None:
-    """Write claims of one project over the expired ones of the same segments, a few statements for any number."""
-    drop_claims(session, claims[0].project_id, [(claim.trajectory_id, claim.start) for claim in claims])
-    session.add_all(claims)
+def add_items(session: Session, items: Sequence[Mapping[str, object]]) -> None:
+    """Write the items of a batch, by column."""
+    session.connection().execute(insert(session, AcquisitionItemRow), [dict(item) for item in items])
+
+
+def take_claims(session: Session, claims: Sequence[Mapping[str, object]]) -> None:
+    """Write claims, by column, over the expired ones of the same segments."""
+    statement = insert(session, ClaimRow)
+    taken = {name: statement.excluded[name] for name in ("acquisition_id", "purpose", "token", "expires_at")}
+    statement = statement.on_conflict_do_update(index_elements=("project_id", "trajectory_id", "start"), set_=taken)
+    session.connection().execute(statement, [dict(claim) for claim in claims])
 
 
 class Claim(NamedTuple):
@@ -150,6 +194,13 @@ def drop_from_queues(session: Session, project_id: UUID, segments: Sequence[Segm
         rows = select(QueueRow.scoring_id, QueueRow.rank).where(QueueRow.project_id == project_id, named)
         gone = tuple_(QueueRow.scoring_id, QueueRow.rank).in_(rows.with_for_update(skip_locked=True))
         session.execute(delete(QueueRow).where(gone).execution_options(synchronize_session=False))
+
+
+def note_leased(session: Session, scoring_id: UUID, ranks: Sequence[int], until: datetime) -> None:
+    """Note in a queue, whose rows the caller has read under a lock, that these are leased until then."""
+    for i in range(0, len(ranks), 500):
+        named = (QueueRow.scoring_id == scoring_id, QueueRow.rank.in_(ranks[i : i + 500]))
+        session.connection().execute(update(QueueRow).where(*named).values(leased_until=until))
 
 
 def pass_over(session: Session, project_id: UUID, segments: Sequence[Segment], until: datetime | None) -> None:
