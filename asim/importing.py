@@ -33,7 +33,7 @@ def add_labeled(
 ) -> Iterator[tuple[int, LabelsAccepted]]:
     """Post the files as labeled trajectories, a batch after the other; how many it held, and what became of it.
 
-    A file with more segments than one request may bring is sent more than once, each time with others of them.
+    A file with more segments than one request may bring is sent in parts, which count each.
     """
     known, source = client.project(project), LabelSource(kind="import", name="asim import")
     read = (piece for path in paths for piece in _pieces(_labeled_trajectory(path, split), known))

@@ -1,6 +1,6 @@
 """Model error: how well a world model predicts labeled segments and inverse dynamics recovers their actions."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,14 +63,16 @@ def evaluate(
     groups: Mapping[str, set[int]],
     inverse_dynamics: InverseDynamics | None = None,
     chunk: int = 512,
+    after_each: Callable[[], None] = lambda: None,
 ) -> ModelError:
     """One-step errors over all transitions of labeled segments (on the models' device).
 
-    groups: name -> discrete actions, e.g. {"movement": {0, 1, 2}}. Raises ValueError for a batch without actions.
+    groups: name -> discrete actions, e.g. {"movement": {0, 1, 2}}. after_each: called after each chunk; may raise to
+    stop. Raises ValueError for a batch without actions.
     """
     if batch.actions is None:
         raise ValueError("Evaluation needs labeled segments; the batch carries no actions.")
-    errors = transition_errors(world_model, batch, inverse_dynamics, chunk)
+    errors = transition_errors(world_model, batch, inverse_dynamics, chunk, after_each)
     actions = batch.transitions().actions
     everything = torch.ones(len(errors.distance), dtype=torch.bool, device=errors.distance.device)
     return ModelError(
@@ -81,14 +83,17 @@ def evaluate(
 
 @torch.inference_mode()
 def transition_errors(
-    world_model: WorldModel, batch: SegmentBatch, inverse_dynamics: InverseDynamics | None = None, chunk: int = 512
+    world_model: WorldModel,
+    batch: SegmentBatch,
+    inverse_dynamics: InverseDynamics | None = None,
+    chunk: int = 512,
+    after_each: Callable[[], None] = lambda: None,
 ) -> TransitionErrors:
     """The parts of the model error of every transition, in the order of `batch.transitions()`."""
-    pairs = batch.transitions()
-    parts = [
-        _errors(world_model, pairs.take(slice(start, start + chunk)), inverse_dynamics)
-        for start in range(0, pairs.size, chunk)
-    ]
+    pairs, parts = batch.transitions(), list[TransitionErrors]()
+    for start in range(0, pairs.size, chunk):
+        parts.append(_errors(world_model, pairs.take(slice(start, start + chunk)), inverse_dynamics))
+        after_each()
     inverse = [part.inverse_correct for part in parts if part.inverse_correct is not None]
     return TransitionErrors(
         distance=torch.cat([part.distance for part in parts]),

@@ -32,7 +32,8 @@ def _check_successor(session: Session, row: JobRow) -> None:
     payload = jobs.payload_of(row)
     if row.state == "done" and row.project_id is not None and isinstance(payload, TrainRound):
         scoring = acquisition_queries.newest_scoring(session, row.project_id, payload.strategy, payload.round)
-        at_work = None if scoring is None else job_queries.unfinished(session, scoring.id)
+        scored_now = scoring is not None and scoring.status == "scoring"
+        at_work = job_queries.unfinished(session, scoring.id) if scoring and scored_now else None
         if at_work is not None:
             raise JobFinished(row.id, row.state, at_work.id)
 

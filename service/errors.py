@@ -144,6 +144,17 @@ class BudgetExhausted(ServiceError):
         super().__init__(f"count: asked for {asked} segments, {remaining} of the budget of {total} labels remain")
 
 
+class KeyBusy(ServiceError):
+    """Too many requests use this Idempotency-Key at this moment."""
+
+    status_code = 503
+
+    def __init__(self, key: str) -> None:
+        super().__init__(
+            f"Idempotency-Key {key[:LONGEST]!r} is in use by other requests; nothing was stored, try again"
+        )
+
+
 class IdempotencyKeyReused(ServiceError):
     """An Idempotency-Key stands for one request."""
 

@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 
 from api_schemas.jobs import PRIORITIES, QUEUES, Canary, Job, JobPayload
 from service import events, origin
+from service.clock import Clock
 from service.errors import JobFinished, JobLost, UnknownResource
 from service.store.queries import jobs as queries
 from service.store.tables import JobRow, WorkerRow
@@ -100,9 +101,12 @@ def held(session: Session, lease: Lease) -> JobRow:
     return row
 
 
-def heartbeat(session: Session, lease: Lease, now: datetime, seconds: float, progress: float, message: str) -> None:
-    """Renew the lease and say how far the job is. Raises JobLost."""
-    row = held(session, lease)
+def heartbeat(session: Session, lease: Lease, clock: Clock, seconds: float, progress: float, message: str) -> None:
+    """Renew the lease and say how far the job is. Raises JobLost.
+
+    The clock is read once the row is locked: the job's own transaction may hold it for a while.
+    """
+    row, now = held(session, lease), clock()
     row.lease_until = now + timedelta(seconds=seconds)
     row.heartbeat_at = now
     row.progress = progress

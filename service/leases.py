@@ -39,6 +39,8 @@ def extend(session: Session, acquisition_id: UUID, token: int, seconds: float | 
     policy = projects.policy_of(project)
     row.status, row.lease_expires_at = "leased", now + timedelta(seconds=seconds or policy.lease_seconds)
     queries.extend_claims(session, row.id, token, row.lease_expires_at)
+    segments = [(claim.trajectory_id, claim.start) for claim in held]
+    queries.pass_over(session, row.project_id, segments, row.lease_expires_at)  # its end may be an earlier one now
     if revived:
         check_budget(session, project, revived, now)
     events.record(session, row.project_id, "lease.extended", {"acquisition": str(row.id), "items": len(held)}, now)

@@ -69,10 +69,10 @@ class Delivery:
             self._asked = True  # once: what the lease still holds is extended by this, and nobody else can take it
             if not self.holds():
                 self._hopeless.add(error.problem.type)
-        faulty = isinstance(error, Invalid) and not self.accepted and len(self.refused) >= FAULTS
-        if faulty or (alone and error.problem.type == BUDGET_EXHAUSTED):
+        if alone and error.problem.type == BUDGET_EXHAUSTED:
             self._hopeless.add(error.problem.type)
-        return error.problem.type in self._hopeless
+        faulty = isinstance(error, Invalid) and not self.accepted and len(self.refused) >= FAULTS
+        return faulty or error.problem.type in self._hopeless
 
     def _request(self, answers: Sequence[Answer]) -> LabelsRequest:
         return LabelsRequest(

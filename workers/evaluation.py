@@ -1,5 +1,7 @@
 """Model error of a round on the project's labeled held-out segments."""
 
+from collections.abc import Callable
+
 from api_schemas.environments import DiscreteActions
 from api_schemas.rounds import GroupError, ModelError
 from models import checkpoints
@@ -18,8 +20,9 @@ def model_error(
     world_model: ModelVersionRow,
     inverse_dynamics: ModelVersionRow,
     held_out: SegmentBatch | None,
+    after_each: Callable[[], None] = lambda: None,
 ) -> ModelError:
-    """Figures are None where the held-out set is empty."""
+    """Figures are None where the held-out set is empty. after_each: called after each chunk; may raise to stop."""
     if held_out is None:
         return ModelError(transitions=0, loss=None, dynamics_accuracy=None, inverse_accuracy=None)
     actions = projects.spaces_of(project).actions
@@ -29,6 +32,7 @@ def model_error(
         held_out,
         {name: set(members) for name, members in groups.items()},
         load_network(blobs, inverse_dynamics, project),  # type: ignore[arg-type]  # the checkpoint's kind was checked
+        after_each=after_each,
     )
     by_group = {name: _group(group) for name, group in figures.groups.items()}
     return ModelError.model_validate({**_group(figures.overall).model_dump(), "by_group": by_group})

@@ -107,7 +107,7 @@ class RunningJob:
         worker, seconds = self.worker, self.worker.settings.job_lease_seconds
         try:
             with worker.database.write() as session:
-                jobs.heartbeat(session, self.lease, self.now(), seconds, self._progress, self._message)
+                jobs.heartbeat(session, self.lease, self.now, seconds, self._progress, self._message)
                 jobs.worker_alive(session, worker.owner, worker.queues, self.now())
         except JobLost:
             self._lost.set()

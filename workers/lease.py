@@ -36,6 +36,8 @@ class Lease:
             if self._client.acquisition(self._acquisition.id).status != "labeled":
                 raise lost([error], len(self._acquisition.items)) or error from error
             self._half = NEVER  # all that follows is a duplicate, no loss: there is nothing to ask for again
+        except Conflict:  # others have spent the budget: what of the answers it still has room for, delivery finds out
+            self._half = NEVER
 
     def holds(self) -> bool:
         """Whether anything is left to answer under the lease, which is extended then."""

@@ -16,6 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service import canary, jobs, reaper
 from service.clock import utc_now
 from service.collector import freeze_imports
+from service.errors import ServiceError
 from service.log import configure_logs, get_logger
 from service.settings import Settings
 from workers.dispatch import open_worker, run_next
@@ -50,7 +51,7 @@ def _reap(worker: Worker) -> None:
         reaper.reap(worker.database, worker.clock())
         with worker.database.write() as session:
             canary.plant(session, worker.clock(), worker.settings.canary_seconds / 4)
-    except SQLAlchemyError as error:
+    except (SQLAlchemyError, ServiceError) as error:
         log.warning("reaping_failed", error=str(error))
 
 

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from api_schemas.jobs import ScoreShard
@@ -17,6 +18,7 @@ from models.acquisition import STRATEGIES
 from models.acquisition.base import Models, score_pool
 from models.acquisition.diversification import diversify, features
 from service import projects, rounds, scorings
+from service.log import get_logger
 from service.scorings import Ranked
 from service.store.blobs import Blobs
 from service.store.database import Database
@@ -27,6 +29,8 @@ from service.store.tables import MembershipRow, ProjectRow, ScoringRow, ShardRow
 from workers import data
 from workers.evaluation import load_network
 from workers.job import RunningJob
+
+log = get_logger("worker")
 
 
 @dataclass(frozen=True)
@@ -84,9 +88,17 @@ def run_selection(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, o
         published = scorings.publish(session, scoring.id, ranked, job.now())
         if published.round_id is not None:
             rounds.make_current(session, published.round_id, job.now())
-    with job.worker.database.write() as session:
-        queries.note_sizes(session)
+    _note_sizes(job)
     return {"queued": len(ranked), "pool": len(pool.scores)}
+
+
+def _note_sizes(job: RunningJob) -> None:
+    """The queue is published and good; this makes it quicker only."""
+    try:
+        with job.worker.database.write() as session:
+            queries.note_sizes(session)
+    except SQLAlchemyError as error:
+        log.warning("sizes_not_noted", error=str(error))
 
 
 def load_models(database: Database, blobs: Blobs, project: ProjectRow, round_id: UUID | None) -> Models:
@@ -110,7 +122,7 @@ def _scores(
     total = sum(len(window.starts) for window in windows)
     parts: list[torch.Tensor] = []
     for batch in data.chunks(job.worker.blobs, windows, project.segment_length, job.go_on):
-        parts.append(score_pool(STRATEGIES[scoring.strategy], models, batch, generator))
+        parts.append(score_pool(STRATEGIES[scoring.strategy], models, batch, generator, after_each=job.go_on))
         done = sum(len(part) for part in parts)
         job.report(done / total, f"scored {done} of {total} segments with {scoring.strategy}")
     return torch.cat(parts).float().numpy()

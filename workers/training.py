@@ -149,7 +149,7 @@ def _evaluate_stage(job: RunningJob, plan: Plan) -> None:
     started = time.monotonic()
     job.report(len(plan.stages) / (len(plan.stages) + 1), f"round {plan.round.number}: evaluation")
     held_out = _labels(job, plan, "held_out")
-    error = model_error(job.worker.blobs, plan.project, world_model, inverse, held_out)
+    error = model_error(job.worker.blobs, plan.project, world_model, inverse, held_out, job.go_on)
     with job.transaction() as session:
         rounds.record_error(session, plan.round.id, error, job.now())
         rounds.stage_done(session, plan.round.id, "evaluation", time.monotonic() - started)

@@ -155,7 +155,8 @@ def import_files(
                 place = f"{receipt.split}, {receipt.transitions} transitions"
                 typer.echo(f"{receipt.source}: {receipt.status} {receipt.id} ({place})")
         for sent, accepted in add_labeled(client, found.id, labeled, split):
-            typer.echo(f"{sent} labeled files: {accepted.created} labels, {accepted.duplicates} known before")
+            told = f"{accepted.created} labels, {accepted.duplicates} known before"
+            typer.echo(f"{sent} labeled trajectories or parts of them: {told}")
 
 
 def _environment(simulator: str | None, options: list[str], spaces: Path | None) -> "Environment":

@@ -1,5 +1,6 @@
 """What every strategy offers, the models it may ask for, and scoring of a whole pool."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -49,17 +50,22 @@ class Strategy(Protocol):
 
 @torch.inference_mode()
 def score_pool(
-    strategy: Strategy, models: Models, batch: SegmentBatch, generator: torch.Generator, chunk: int = CHUNK
+    strategy: Strategy,
+    models: Models,
+    batch: SegmentBatch,
+    generator: torch.Generator,
+    chunk: int = CHUNK,
+    after_each: Callable[[], None] = lambda: None,
 ) -> Tensor:
-    """Scores (B,) on the CPU of any number of segments, `chunk` at a time.
+    """Scores (B,) on the CPU of any number of segments, `chunk` at a time; after_each: called then, may raise to stop.
 
     Raises ValueError when `models` lacks what the strategy needs, NonFiniteScoreError naming the first segment.
     """
     require(strategy, models)
-    parts = [
-        strategy.score(models, batch.take(slice(start, start + chunk)), generator)
-        for start in range(0, batch.size, chunk)
-    ]
+    parts: list[Tensor] = []
+    for start in range(0, batch.size, chunk):
+        parts.append(strategy.score(models, batch.take(slice(start, start + chunk)), generator))
+        after_each()
     scores = torch.cat(parts).cpu() if parts else torch.zeros(0)
     _require_finite(strategy, scores, batch)
     return scores

@@ -73,7 +73,7 @@ def test_recordings_are_imported_once_and_labeled_ones_with_their_labels(
     labeled = str(recording(tmp_path / "labeled.npz", 9, labeled=True))
     printed = asim("import", own, *plain, labeled, "--split", "pool")
     assert printed.count(": created ") == 3
-    assert "1 labeled files: 12 labels, 0 known before" in printed
+    assert "1 labeled trajectories or parts of them: 12 labels, 0 known before" in printed
     again = asim("import", own, *plain, labeled, "--split", "pool")
     assert again.count(": duplicate ") == 3
     assert "0 labels, 12 known before" in again

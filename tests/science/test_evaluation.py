@@ -80,3 +80,9 @@ def test_a_group_without_transitions_has_no_error() -> None:
 def test_evaluation_needs_actions(world_model: GridWorldModel, held_out: SegmentBatch) -> None:
     with pytest.raises(ValueError, match="no actions"):
         evaluate(world_model, held_out.without_labels(), toy_grid.GROUPS)
+
+
+def test_each_chunk_is_told(world_model: GridWorldModel, held_out: SegmentBatch) -> None:
+    told: list[None] = []
+    evaluate(world_model, held_out, toy_grid.GROUPS, chunk=50, after_each=lambda: told.append(None))
+    assert len(told) == -(-held_out.transitions().size // 50)

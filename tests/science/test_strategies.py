@@ -83,3 +83,16 @@ def test_a_non_finite_score_names_its_segment(models: Models, pool: SegmentBatch
 
     with pytest.raises(NonFiniteScoreError, match=r"broken gave nan to Segment\(trajectory='toy-11', start=3\)"):
         score_pool(Broken(), models, pool, torch.Generator(), chunk=1000)
+
+
+def test_scoring_stops_between_two_chunks(pool: SegmentBatch) -> None:
+    told: list[None] = []
+
+    def stop() -> None:
+        told.append(None)
+        if len(told) == 2:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        score_pool(STRATEGIES["random"], Models(), pool, torch.Generator(), chunk=10, after_each=stop)
+    assert len(told) == 2

@@ -92,7 +92,7 @@ def test_a_heartbeat_keeps_the_job_and_shows_its_progress(served: Served) -> Non
     for beat in range(3):
         served.clock.advance(LEASE - 1)
         with served.services.database.write() as session:
-            jobs.heartbeat(session, lease, served.clock(), LEASE, beat / 4, f"epoch {beat}")
+            jobs.heartbeat(session, lease, served.clock, LEASE, beat / 4, f"epoch {beat}")
         reap(served)
     shown = served.get(f"/jobs/{job}")
     assert (shown["state"], shown["attempts"], shown["progress"], shown["message"]) == ("running", 1, 0.5, "epoch 2")
@@ -124,7 +124,7 @@ def test_a_silent_workers_job_goes_to_another_and_its_late_writes_are_refused(on
         lambda session: jobs.complete(session, silent, {}, on_both.clock()),
         lambda session: jobs.fail(session, silent, "late", on_both.clock(), retry=True),
         lambda session: jobs.give_back(session, silent, on_both.clock()),
-        lambda session: jobs.heartbeat(session, silent, on_both.clock(), LEASE, 1.0, "late"),
+        lambda session: jobs.heartbeat(session, silent, on_both.clock, LEASE, 1.0, "late"),
     ]
     for write in writes:
         with pytest.raises(JobLost), on_both.services.database.write() as session:
@@ -498,10 +498,13 @@ def test_a_job_works_for_as_long_as_it_took_to_get_ready_before_it_gives_way(
     worker.stopping.clear()
 
 
-def test_a_job_that_has_said_nothing_for_long_is_not_renewed_and_goes_to_another(on_both: Served) -> None:
-    project = on_both.project()
+def test_a_job_that_has_said_nothing_for_long_is_not_renewed_and_goes_to_another(
+    on_both: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, seconds = on_both.project(), [100.0]
+    monkeypatch.setattr("workers.job.time", SimpleNamespace(monotonic=lambda: seconds[0]))
     worker = on_both.worker("train")
-    bounded = replace(worker, settings=worker.settings.model_copy(update={"silence_seconds": 0.2}))
+    bounded = replace(worker, settings=worker.settings.model_copy(update={"silence_seconds": 60.0}))
     job = enqueue(on_both, project, generator(project))
     with on_both.services.database.write() as session:
         row = jobs.claim(session, job, worker.owner, on_both.clock(), LEASE)
@@ -509,13 +512,13 @@ def test_a_job_that_has_said_nothing_for_long_is_not_renewed_and_goes_to_another
         running = RunningJob(bounded, jobs.lease_of(row))
     with capture_logs() as said:
         for step in (running.go_on, lambda: running.report(0.5, "step 1"), lambda: _write(running)):
-            time.sleep(0.25)
+            seconds[0] += 61
             step()  # it was slow, and is not hung
             on_both.clock.advance(LEASE - 1)
             running.beat()
             reap(on_both)
             assert on_both.get(f"/jobs/{job}")["state"] == "running"
-        time.sleep(0.25)
+        seconds[0] += 61
         on_both.clock.advance(LEASE - 1)
         running.beat()
         on_both.clock.advance(2)

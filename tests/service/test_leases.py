@@ -251,6 +251,16 @@ def test_a_lease_that_ends_while_another_waits_for_the_project_counts_as_ended(o
     refused(on_postgres.client.post(f"/acquisitions/{first['id']}/extend", json=lease), 410, "lease-lost")
 
 
+def test_a_lease_that_was_shortened_hides_its_segments_no_longer_than_it_lasts(on_both: Served) -> None:
+    project = on_both.project()
+    on_both.upload(project, room(0))
+    first = on_both.acquire(project, 2, lease_seconds=86400)
+    lease = {"token": first["token"], "lease_seconds": 60}
+    assert on_both.client.post(f"/acquisitions/{first['id']}/extend", json=lease).status_code == 200
+    on_both.clock.advance(61)
+    assert segments(on_both.acquire(project, 2)) == segments(first)
+
+
 def test_rows_that_refer_to_a_locked_project_are_written_all_the_same(on_postgres: Served) -> None:
     project = UUID(on_postgres.project())
     with on_postgres.services.database.write() as session:

@@ -87,7 +87,7 @@ def test_labels_whose_connection_is_ended_are_to_be_sent_again(start: Serve, pos
 def test_a_transaction_that_stood_still_for_too_long_is_to_be_done_again(
     start: Serve, postgres_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(database.WAITS, "idle_in_transaction_session_timeout", 200)
+    monkeypatch.setitem(database.WAITS, "idle_in_transaction_session_timeout", 1000)
     served, find = start(database_url=postgres_url), projects.find
     project = served.project()
 

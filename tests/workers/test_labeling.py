@@ -294,6 +294,32 @@ def test_a_service_that_finds_fault_with_every_label_is_not_asked_about_each(
     assert labeled.client.acquisition(batch.id).status == "released"
 
 
+def test_one_fault_does_not_spoil_a_later_request_where_many_spoiled_the_first(
+    labeled: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(delivery, "BATCH", 50)
+    batch, before = labeled.acquire(100, "random"), labeled.project.label_watermark
+    wrong = [*batch.items[:25], batch.items[70]]
+    _spoil(monkeypatch, {(item.trajectory, item.start) for item in wrong})
+    with pytest.raises(Invalid):
+        run_labeling(labeled.client, batch, np.random.default_rng(0))
+    assert labeled.project.label_watermark == before + 74
+
+
+def test_a_budget_that_others_spend_meanwhile_costs_no_answer_that_has_room(labeled: Loop) -> None:
+    batch, before = labeled.acquire(10, "random", lease_seconds=60), labeled.project.counts.labeled
+
+    def overslept(done: int, of: int) -> None:
+        if done == 1:
+            labeled.clock.advance(90)
+            labeled.change(label_budget=before + 5)
+
+    with pytest.raises(Conflict, match="budget"):
+        run_labeling(labeled.client, batch, np.random.default_rng(0), overslept, labeled.clock)
+    assert labeled.project.counts.labeled == before + 5
+    assert labeled.client.acquisition(batch.id).status == "released"
+
+
 def test_an_exploration_whose_episode_ends_early_is_given_back_and_the_others_are_stored(
     empty: Loop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,7 +360,7 @@ def test_a_budget_without_room_for_one_label_is_not_asked_about_each(
     labeled: Loop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The lease had ended, and what it had reserved was spent by others meanwhile: but for five labels."""
-    batch = labeled.acquire(200, "random", lease_seconds=60)
+    batch = labeled.acquire(80, "random", lease_seconds=60)
     before = labeled.project.counts.labeled
 
     def overslept(done: int, of: int) -> None:

@@ -215,9 +215,9 @@ def test_a_stopping_worker_gives_a_shard_back(trained: Loop, monkeypatch: pytest
     trained.ask_for_queue("vanilla_cycle")
     run_next(trained.worker)  # trains the dense inverse dynamics
 
-    def stop(*args: Any) -> torch.Tensor:
+    def stop(*args: Any, **more: Any) -> torch.Tensor:
         trained.worker.stopping.set()
-        return score_pool(*args)
+        return score_pool(*args, **more)
 
     monkeypatch.setattr(scoring, "score_pool", stop)
     run_next(trained.worker)

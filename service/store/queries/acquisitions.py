@@ -5,11 +5,10 @@ from datetime import datetime
 from typing import NamedTuple
 from uuid import UUID
 
-from sqlalchemy import ColumnElement, Select, and_, delete, func, or_, select, text, tuple_, update
+from sqlalchemy import ColumnElement, Integer, Select, and_, bindparam, delete, func, or_, select, text, tuple_, update
 from sqlalchemy.orm import Session
 
 from service.store.queries.inserting import insert
-from service.store.queries.pool import live_claim
 from service.store.queries.segments import Segment, among, parts
 from service.store.tables import (
     AcquisitionItemRow,
@@ -21,6 +20,30 @@ from service.store.tables import (
     ScoringRow,
     ShardRow,
 )
+
+LABELED = select(LabelRow.id).where(
+    LabelRow.project_id == QueueRow.project_id,
+    LabelRow.trajectory_id == QueueRow.trajectory_id,
+    LabelRow.start == QueueRow.start,
+)
+LEASED = select(ClaimRow.token).where(
+    ClaimRow.project_id == QueueRow.project_id,
+    ClaimRow.trajectory_id == QueueRow.trajectory_id,
+    ClaimRow.start == QueueRow.start,
+    ClaimRow.expires_at > bindparam("now"),
+)
+# Not outer joins: without statistics PostgreSQL joins them by the claims' expiry, every claim to every row.
+FREE = and_(
+    QueueRow.scoring_id == bindparam("scoring"),
+    or_(QueueRow.leased_until.is_(None), QueueRow.leased_until <= bindparam("now")),
+    ~LABELED.exists(),
+    ~LEASED.exists(),
+)
+# Built once: to build them takes longer than to run them.
+FRONT = select(QueueRow.rank, QueueRow.trajectory_id, QueueRow.start, QueueRow.score).where(FREE)
+FRONT = FRONT.order_by(QueueRow.rank).limit(bindparam("count", type_=Integer()))
+FRONT_LOCKED = FRONT.with_for_update(of=QueueRow, skip_locked=True)
+STILL_FREE = select(QueueRow.rank).where(FREE, QueueRow.rank.between(bindparam("first"), bindparam("last")))
 
 
 def newest_scoring(
@@ -68,35 +91,16 @@ def free_queue(session: Session, scoring: ScoringRow, count: int, now: datetime,
 
     lock: pass over the rows that another acquisition reads at this moment (PostgreSQL; SQLite has one writer anyway).
     """
-    columns = (QueueRow.rank, QueueRow.trajectory_id, QueueRow.start, QueueRow.score)
-    statement = select(*columns).where(*_free(scoring, now)).order_by(QueueRow.rank).limit(count)
-    found = session.execute(statement.with_for_update(of=QueueRow, skip_locked=True) if lock else statement)
-    return [Queued(*row) for row in found]
+    asked = {"scoring": scoring.id, "now": now, "count": count}
+    return [Queued(*row) for row in session.execute(FRONT_LOCKED if lock else FRONT, asked)]
 
 
 def still_free(session: Session, scoring: ScoringRow, rows: Sequence[Queued], now: datetime) -> set[int]:
     """Ranks of the queue between the first and the last of these rows, in order, whose segments are free now."""
     if not rows:
         return set()
-    between = QueueRow.rank.between(rows[0].rank, rows[-1].rank)
-    return set(session.scalars(select(QueueRow.rank).where(*_free(scoring, now), between)))
-
-
-def _free(scoring: ScoringRow, now: datetime) -> tuple[ColumnElement[bool], ...]:
-    label = select(LabelRow.id).where(
-        LabelRow.project_id == QueueRow.project_id,
-        LabelRow.trajectory_id == QueueRow.trajectory_id,
-        LabelRow.start == QueueRow.start,
-    )
-    claim = select(ClaimRow.token).where(
-        ClaimRow.project_id == QueueRow.project_id,
-        ClaimRow.trajectory_id == QueueRow.trajectory_id,
-        ClaimRow.start == QueueRow.start,
-        live_claim(now),
-    )
-    awake = or_(QueueRow.leased_until.is_(None), QueueRow.leased_until <= now)
-    # Not outer joins: without statistics PostgreSQL joins them by the claims' expiry, every claim to every row.
-    return QueueRow.scoring_id == scoring.id, awake, ~label.exists(), ~claim.exists()
+    asked = {"scoring": scoring.id, "now": now, "first": rows[0].rank, "last": rows[-1].rank}
+    return set(session.scalars(STILL_FREE, asked))
 
 
 def add_items(session: Session, items: Sequence[Mapping[str, object]]) -> None:

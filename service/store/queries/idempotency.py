@@ -3,9 +3,9 @@
 from datetime import datetime
 
 from sqlalchemy import ColumnElement, delete, select
-from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
+from service.errors import KeyBusy
 from service.store.queries.inserting import insert
 from service.store.tables import IdempotencyRow
 
@@ -20,6 +20,7 @@ def insert_or_find(
     The insert waits for another transaction that has just inserted the same key; what that one committed is found,
     by a statement of its own and so a snapshot of its own. It may be gone by then: expired, and dropped by the reaper
     or by another request with the same key, whose fresh row the next insert waits for. So it is tried more than once.
+    Raises KeyBusy.
     """
     values = {"caller": caller, "route": route, "key": key, "request_sha256": request_sha256, "expires_at": expires_at}
     fresh = insert(session, IdempotencyRow).values(values).on_conflict_do_nothing().returning(IdempotencyRow)
@@ -32,7 +33,7 @@ def insert_or_find(
             return found
         expired = delete(IdempotencyRow).where(IdempotencyRow.expires_at <= now, *_named(caller, route, key))
         session.execute(expired)  # it stands for nothing any more
-    raise PoolTimeout(f"the row of Idempotency-Key {key!r} came and went {ATTEMPTS} times")  # not now: a 503
+    raise KeyBusy(key)
 
 
 def kept(session: Session, caller: str, route: str, key: str, now: datetime) -> IdempotencyRow | None:

@@ -18,8 +18,9 @@ def next_job(session: Session, queues: Sequence[str], now: datetime) -> JobRow |
 
 
 def locked_job(session: Session, job_id: UUID) -> JobRow | None:
-    """The job's row, locked where the database locks rows."""
-    return session.scalar(select(JobRow).where(JobRow.id == job_id).with_for_update())
+    """The job's row, locked where the database locks rows, and then read anew."""
+    statement = select(JobRow).where(JobRow.id == job_id).with_for_update()
+    return session.scalar(statement.execution_options(populate_existing=True))
 
 
 def higher_waiting(session: Session, queues: Sequence[str], priority: int, now: datetime) -> bool:

@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import NamedTuple
 from uuid import UUID
 
-from sqlalchemy import ColumnElement, and_, func, select
+from sqlalchemy import ColumnElement, and_, bindparam, func, select
 from sqlalchemy.orm import Session
 
 from api_schemas.base import Split
@@ -35,11 +35,16 @@ class Leased(NamedTuple):
         return self.pool + self.explore
 
 
+LEASED = (
+    select(ClaimRow.purpose, func.count())
+    .where(ClaimRow.project_id == bindparam("project"), ClaimRow.expires_at > bindparam("now"))
+    .group_by(ClaimRow.purpose)
+)
+
+
 def leased(session: Session, project_id: UUID, now: datetime) -> Leased:
     """What of a project is under a live lease."""
-    where = (live_claim(now), ClaimRow.project_id == project_id)
-    counts = session.execute(select(ClaimRow.purpose, func.count()).where(*where).group_by(ClaimRow.purpose))
-    by_purpose: dict[str, int] = dict(iter(counts))
+    by_purpose: dict[str, int] = dict(iter(session.execute(LEASED, {"project": project_id, "now": now})))
     return Leased(**by_purpose)
 
 
