@@ -5,8 +5,9 @@
 
 The service is an `asim serve` of its own; the client asks one call after another over one connection, so the figures
 are latencies without waiting for other clients; its garbage collector rests meanwhile. The queue is selected once, long
-enough for all calls of a run; after each its batches are given back. Percentiles are medians over the runs, as the
-machine may be another's too. --database is the URL of an empty database; without it the service keeps its own file.
+enough for all calls of a run; after each its batches are given back. What was filled is on the disk before the first.
+Percentiles are medians over the runs, as the machine may be another's too. --database is the URL of an empty database
+(of a user who may CHECKPOINT); without it the service keeps its own file.
 """
 
 import argparse
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from sqlalchemy import create_engine
 
 from api_schemas.acquisitions import Acquisition
 from api_schemas.projects import Project
@@ -84,6 +86,7 @@ def measure(client: Client, pool: int, transitions: int = 50) -> Measured:
     ranked = time.perf_counter()
     for _ in range(WARM_UP - 1):
         client.acquire(project.id, COUNT, wait=0)
+    _settle(os.environ.get("ASIM_DATABASE_URL", ""))
     runs = [_run(client, project, pool) for _ in range(RUNS)]
     return Measured(filled - began, ranked - filled, runs)
 
@@ -97,6 +100,16 @@ def _run(client: Client, project: Project, pool: int) -> list[float]:
     for _, batch in calls:
         client.release(batch.id, batch.token or 0)
     return [seconds for seconds, _ in calls]
+
+
+def _settle(database: str) -> None:
+    """Have what was filled on the disk: else the commits of the calls wait for the rest of it."""
+    if database.startswith("postgresql"):
+        engine = create_engine(database, isolation_level="AUTOCOMMIT")
+        with engine.connect() as connection:
+            connection.exec_driver_sql("CHECKPOINT")
+        engine.dispose()
+    os.sync()
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import signal
 import statistics
+import time
 from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
@@ -26,6 +27,7 @@ from tests.scale.conftest import Deploy
 POOL, TRANSITIONS, SHARD = 200_000, 2500, 12_500  # segments; of a trajectory; segments of a shard
 LABELS_PER_ACTION = 2
 REPEATS, TARGET = 3, 1.7
+LOOK_SECONDS = 0.5
 COLLECT_SECONDS, ROUND_SECONDS, SCORE_SECONDS = 120.0, 180.0, 300.0
 
 
@@ -102,6 +104,7 @@ def _await_both(deployment: Deployment, project: UUID) -> None:
 
 
 def _is_ready(deployment: Deployment, scoring: UUID) -> bool:
+    time.sleep(LOOK_SECONDS)  # to look all the time would cost the workers a fifth of a core
     with deployment.database.read() as session:
         status = scorings.find(session, scoring).status
         waiting = job_queries.unfinished(session, scoring)  # the merge's job ends a little after its queue is there
