@@ -173,7 +173,7 @@ def test_jobs_are_listed_and_cancelled_and_events_say_who_did_what(asim: Asim, u
 def test_followed_events_arrive_as_they_happen_until_ctrl_c(asim: Asim, url: str, own: str) -> None:
     argv = [sys.executable, "-m", "asim", "events", own, "--follow", "--url", url]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as following:
-        watchdog = threading.Timer(30, following.kill)
+        watchdog = threading.Timer(90, following.kill)
         watchdog.start()
         try:
             assert following.stdout is not None
@@ -181,7 +181,7 @@ def test_followed_events_arrive_as_they_happen_until_ctrl_c(asim: Asim, url: str
             asim("project", "set", own, "--round-labels", "7")
             assert following.stdout.readline().endswith(' project.changed {"round_labels": 7}\n')
             following.send_signal(signal.SIGINT)
-            assert following.wait(timeout=10) == 0
+            assert following.wait(timeout=45) == 0
         finally:
             watchdog.cancel()
             following.kill()
