@@ -11,8 +11,8 @@ import structlog
 from sqlalchemy import delete
 
 from service.settings import Settings
+from service.store.columns import Row
 from service.store.database import migrate
-from service.store.tables import Row
 from tests.servers import postgres_database, postgres_server, postgres_url, redis_server, redis_space
 from tests.service.kit import MAX_BODY_BYTES, START, Served, serve
 

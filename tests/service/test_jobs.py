@@ -1,23 +1,18 @@
 """The job table: claimed by priority under a lease and a fence, taken from the silent, at last given up."""
 
-import time
 from collections.abc import Callable
-from dataclasses import replace
-from types import SimpleNamespace
 from uuid import UUID, uuid4
 
 import pytest
-from httpx2 import Response
 from sqlalchemy import select
 from sqlalchemy.orm import Session
-from structlog.testing import capture_logs
 
 from api_schemas.jobs import JobPayload, ScoreShard, TrainRound, TrainSubgoalGenerator
-from service import canary, jobs, reaper, rounds, scorings
+from service import jobs, reaper, scorings
 from service.errors import JobLost, UnknownResource
-from service.store.tables import JobRow, ProjectRow, RoundRow, ScoringRow
+from service.store.tables import JobRow, ProjectRow, ScoringRow
 from tests.service.conftest import Serve
-from tests.service.kit import Served, answers, refused, room
+from tests.service.kit import Served, answers, room
 from workers.dispatch import run_job, run_next
 from workers.job import RunningJob
 
@@ -59,12 +54,6 @@ def round_asked_for(served: Served, project: str) -> str:
     started = served.client.post("/rounds", json={"project": project})
     assert started.status_code == 202, started.text
     return str(started.headers["location"])
-
-
-def cancel(served: Served, job: object, status: int = 200) -> Response:
-    answer = served.client.delete(f"/jobs/{job}")
-    assert answer.status_code == status, answer.text
-    return answer
 
 
 def generator(project: str) -> TrainSubgoalGenerator:
@@ -320,217 +309,3 @@ def test_a_message_cannot_grant_an_attempt_more(served: Served) -> None:
         assert jobs.claim(session, job, "bob", served.clock(), LEASE) is None
     reap(served)
     assert served.get(f"/jobs/{job}")["state"] == "failed"
-
-
-def test_a_cancelled_job_is_never_run(on_both: Served) -> None:
-    project = on_both.project()
-    job = enqueue(on_both, project, generator(project))
-    assert cancel(on_both, job).json()["state"] == "cancelled"
-    with on_both.services.database.write() as session:
-        assert jobs.claim(session, job, "ada", on_both.clock(), LEASE) is None
-    again = cancel(on_both, job).json()
-    assert (again["state"], again["attempts"]) == ("cancelled", 0)
-    assert kinds(on_both, project) == ["job.queued", "job.cancelled"]
-
-
-def test_a_cancelled_jobs_holder_has_lost_it(on_both: Served) -> None:
-    project = on_both.project()
-    job = enqueue(on_both, project, generator(project))
-    worker = on_both.worker("train")
-    with on_both.services.database.write() as session:
-        row = jobs.claim(session, job, worker.owner, on_both.clock(), LEASE)
-        assert row is not None
-        running = RunningJob(worker, jobs.lease_of(row))
-    running.report(0.5, "half way")
-    cancel(on_both, job)
-    with pytest.raises(JobLost), running.transaction():
-        pytest.fail("a cancelled job may not write")
-    running.beat()
-    with pytest.raises(JobLost):
-        running.report(0.6, "further")
-    shown = on_both.get(f"/jobs/{job}")
-    assert shown["state"] == "cancelled"
-    assert shown["finished_at"] is not None
-
-
-def test_a_job_that_has_ended_cannot_be_cancelled(served: Served) -> None:
-    project = served.project()
-    served.upload(project, room(0))
-    job = served.ask(project, 1).json()["job"]
-    served.drain()
-    refused(cancel(served, job, 409), 409, "job-finished", job, "done")
-    refused(cancel(served, uuid4(), 404), 404, "unknown-resource")
-
-
-def test_cancelling_takes_an_admin(served: Served) -> None:
-    project = served.project()
-    job = enqueue(served, project, generator(project))
-    key = served.client.post("/keys", json={"name": "reader", "scopes": ["read", "label", "acquire"]}).json()["secret"]
-    answer = served.client.delete(f"/jobs/{job}", headers={"Authorization": f"Bearer {key}"})
-    refused(answer, 403, "not-allowed", "admin")
-    assert served.get(f"/jobs/{job}")["state"] == "queued"
-
-
-def test_a_cancelled_round_ends_and_its_labels_are_not_due_again(served: Served) -> None:
-    project = served.project(policy={"round_labels": 2})
-    served.upload(project, room(0))
-    batch = served.acquire(project, 3)
-    assert served.label(project, answers(batch)[:2], batch).json()["round"] is not None
-    (shown,) = served.get("/rounds", project=project)["items"]
-    cancel(served, shown["job"])
-    after = served.get(f"/rounds/{shown['id']}")
-    assert (after["status"], after["error"]) == ("cancelled", None)
-    assert after["finished_at"] is not None
-    assert served.label(project, answers(batch)[2:], batch).json()["round"] is None
-    newest = [row["kind"] for row in served.get("/events", project=project, newest=True, limit=1000)["items"]]
-    assert newest.count("round.cancelled") == 1
-    assert len(served.get("/rounds", project=project)["items"]) == 1
-    assert served.client.post("/rounds", json={"project": project}).status_code == 202  # by hand it goes
-
-
-def test_a_round_is_cancelled_with_its_scoring_and_the_next_acquire_starts_another(served: Served) -> None:
-    project = served.project()
-    location = round_asked_for(served, project)
-    with served.services.database.write() as session:
-        round_row = session.get_one(RoundRow, UUID(location.split("/")[-1]))
-        round_row.status = "scoring"
-        row = session.get_one(ProjectRow, UUID(project))
-        scoring = scorings.start(session, row, "cycle", round_row, served.clock(), served.services.limits)
-        job = session.scalars(select(JobRow).where(JobRow.subject_id == scoring.id)).one().id
-    cancel(served, job)
-    with served.services.database.write() as session:
-        assert session.get_one(ScoringRow, scoring.id).status == "failed"
-        rounds.make_current(session, round_row.id, served.clock())
-    assert served.get(location)["status"] == "cancelled"
-
-
-def test_a_cancelled_scoring_without_a_round_leaves_the_project_usable(served: Served) -> None:
-    project = served.project()
-    served.upload(project, room(0))
-    first = served.ask(project, 1).json()["job"]
-    cancel(served, first)
-    assert served.ask(project, 1).json()["job"] != first
-    assert len(served.acquire(project, 1)["items"]) == 1
-
-
-def plant(served: Served, every: float = 15.0) -> None:
-    with served.services.database.write() as session:
-        canary.plant(session, served.clock(), every)
-
-
-def canaries(served: Served) -> dict[str, str]:
-    """State by queue."""
-    with served.services.database.read() as session:
-        return {row.queue: row.state for row in session.scalars(select(JobRow).where(JobRow.kind == "canary"))}
-
-
-def test_canaries_come_first_and_are_planted_again_after_a_while(on_both: Served) -> None:
-    project = on_both.project()
-    enqueue(on_both, project, ScoreShard(scoring=uuid4(), shard=0))
-    for _ in range(2):
-        plant(on_both)
-    assert canaries(on_both) == dict.fromkeys(("train", "score", "label"), "queued")
-    for queue in ("train", "score", "label"):
-        lease = claimed(on_both, queue)
-        assert lease.job_id == canary.job_id(queue)
-        with on_both.services.database.write() as session:
-            jobs.complete(session, lease, canary.done(on_both.clock()), on_both.clock())
-    plant(on_both)
-    assert set(canaries(on_both).values()) == {"done"}
-    on_both.clock.advance(16)
-    plant(on_both)
-    assert set(canaries(on_both).values()) == {"queued"}
-    shown = on_both.get(f"/jobs/{canary.job_id('train')}")
-    assert (shown["project"], shown["attempts"]) == (None, 0)
-    assert kinds(on_both, project) == ["job.queued"]  # that of the shard
-    with on_both.services.database.write() as session:  # the service is other tests' too
-        for row in session.scalars(select(JobRow).where(JobRow.state == "queued")):
-            row.state, row.finished_at = "failed", on_both.clock()
-
-
-def test_a_canary_that_failed_is_planted_again(served: Served) -> None:
-    plant(served)
-    for _ in range(3):
-        claimed(served, "label")
-        served.clock.advance(LEASE + 1)
-        reap(served)
-        served.clock.advance(60)
-    assert canaries(served)["label"] == "failed"
-    plant(served)
-    assert canaries(served)["label"] == "queued"
-    lease = claimed(served, "label")
-    with served.services.database.read() as session:
-        assert jobs.find(session, lease.job_id).attempts == 1
-
-
-def test_no_job_gives_way_to_a_canary(served: Served) -> None:
-    project = served.project()
-    enqueue(served, project, generator(project))
-    running = RunningJob(served.worker("train"), claimed(served))
-    running.prepared()
-    time.sleep(0.01)
-    plant(served)
-    assert not running.should_give_way()
-    enqueue(served, project, TrainRound(round=uuid4(), strategy="cycle"))
-    assert running.should_give_way()
-
-
-def test_a_job_works_for_as_long_as_it_took_to_get_ready_before_it_gives_way(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    project, seconds = served.project(), [100.0]
-    monkeypatch.setattr("workers.job.time", SimpleNamespace(monotonic=lambda: seconds[0]))
-    enqueue(served, project, generator(project))
-    worker = served.worker("train")
-    running = RunningJob(worker, claimed(served))
-    enqueue(served, project, TrainRound(round=uuid4(), strategy="cycle"))
-    seconds[0] += 30
-    assert not running.should_give_way()  # it is still loading
-    running.prepared()
-    seconds[0] += 29
-    running.prepared()  # by the next stage
-    assert not running.should_give_way()
-    seconds[0] += 1
-    assert running.should_give_way()
-    seconds[0] -= 30
-    worker.stopping.set()  # the process ends: that waits for nothing
-    assert running.should_give_way()
-    worker.stopping.clear()
-
-
-def test_a_job_that_has_said_nothing_for_long_is_not_renewed_and_goes_to_another(
-    on_both: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    project, seconds = on_both.project(), [100.0]
-    monkeypatch.setattr("workers.job.time", SimpleNamespace(monotonic=lambda: seconds[0]))
-    worker = on_both.worker("train")
-    bounded = replace(worker, settings=worker.settings.model_copy(update={"silence_seconds": 60.0}))
-    job = enqueue(on_both, project, generator(project))
-    with on_both.services.database.write() as session:
-        row = jobs.claim(session, job, worker.owner, on_both.clock(), LEASE)
-        assert row is not None
-        running = RunningJob(bounded, jobs.lease_of(row))
-    with capture_logs() as said:
-        for step in (running.go_on, lambda: running.report(0.5, "step 1"), lambda: _write(running)):
-            seconds[0] += 61
-            step()  # it was slow, and is not hung
-            on_both.clock.advance(LEASE - 1)
-            running.beat()
-            reap(on_both)
-            assert on_both.get(f"/jobs/{job}")["state"] == "running"
-        seconds[0] += 61
-        on_both.clock.advance(LEASE - 1)
-        running.beat()
-        on_both.clock.advance(2)
-        running.beat()
-        reap(on_both)
-    assert on_both.get(f"/jobs/{job}")["state"] == "queued"
-    hangs = [(line["job"], line["last"]) for line in said if line["event"] == "job_hangs"]
-    assert hangs == [(str(job), "step 1")]
-    with pytest.raises(JobLost):
-        _write(running)
-
-
-def _write(running: RunningJob) -> None:
-    with running.transaction():
-        pass

@@ -17,8 +17,9 @@ from sqlalchemy import Engine, create_engine, inspect, pool, select, text
 from sqlalchemy.exc import DBAPIError
 
 from service.settings import Settings
+from service.store.columns import Row
 from service.store.database import migrate, open_database
-from service.store.tables import EventEpochRow, Row
+from service.store.tables import EventEpochRow
 from tests.service.first_schema import EMPTY, FIRST, NAMES, SECOND, fill, narrowed, read, write
 from tests.service.kit import Served, serve
 

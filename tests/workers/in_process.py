@@ -22,7 +22,7 @@ from service.app import create_app
 from service.clock import utc_now
 from service.settings import Settings
 from service.store.blobs import Blobs
-from service.store.tables import Row
+from service.store.columns import Row
 from workers.dispatch import open_worker, run_next
 from workers.job import Worker
 from workers.labeling import run_labeling

@@ -13,7 +13,7 @@ from api_schemas.acquisitions import Acquisition, AcquisitionItem
 from api_schemas.environments import Environment
 from api_schemas.labels import Label, LabelsAccepted, LabelsRequest
 from asim.client import Client
-from asim.errors import Conflict, Invalid, LeaseLost
+from asim.errors import Conflict
 from tests.workers.conftest import ROOM, OpenLoop, new_project
 from tests.workers.in_process import Loop, segments_of
 from workers import delivery, labeling
@@ -210,116 +210,6 @@ def test_explorations_and_labels_beyond_the_byte_limit_go_in_several_requests(
         assert max(sizes) <= 3500  # and what stands around the answers
 
 
-def test_the_lease_of_a_slow_simulator_is_extended_by_its_own_length_when_half_of_it_has_passed(
-    labeled: Loop,
-) -> None:
-    labeled.change(lease_seconds=10)
-    batch = labeled.acquire(20, "random", lease_seconds=600)
-
-    def slow(done: int, of: int) -> None:
-        labeled.clock.advance(100)
-
-    accepted = run_labeling(labeled.client, batch, np.random.default_rng(0), slow, labeled.clock)
-    assert accepted.created == 20
-    extensions = [event for event in labeled.client.events(labeled.project.id) if event.kind == "lease.extended"]
-    assert len(extensions) == 6  # after 300, 600, ... seconds of 2,000
-    ends = labeled.client.acquisition(batch.id).lease_expires_at
-    assert (ends - extensions[-1].created_at).total_seconds() == pytest.approx(600, abs=1)
-
-
-def test_a_short_batch_does_not_extend_its_lease(labeled: Loop) -> None:
-    labeled.label(5, "random")
-    assert "lease.extended" not in {event.kind for event in labeled.client.events(labeled.project.id)}
-
-
-def test_a_lease_that_is_lost_meanwhile_is_said_so_and_what_it_still_covers_is_stored(labeled: Loop) -> None:
-    batch = labeled.acquire(40, "random", lease_seconds=60)
-    taken = []
-
-    def overslept(done: int, of: int) -> None:
-        if done == of:
-            labeled.clock.advance(90)
-            taken.append(labeled.acquire(3, "random"))
-
-    before = labeled.project.counts.labeled
-    with pytest.raises(LeaseLost, match=rf"lost while its 40 items were answered: acquisition {batch.id}: it does"):
-        run_labeling(labeled.client, batch, np.random.default_rng(0), overslept, labeled.clock)
-    assert labeled.project.counts.labeled == before + 37
-    run_labeling(labeled.client, taken[0], np.random.default_rng(0))
-    assert labeled.project.counts.labeled == before + 40
-
-
-def test_a_lease_that_was_given_back_ends_the_labeling_at_once(labeled: Loop) -> None:
-    batch = labeled.acquire(10, "random", lease_seconds=60)
-    labeled.client.release(batch.id, batch.token or 0)
-    labeled.clock.advance(1)
-    done: list[int] = []
-
-    def late(number: int, of: int) -> None:
-        done.append(number)
-        labeled.clock.advance(40)
-
-    with pytest.raises(LeaseLost, match=r"the lease was lost while its 10 items were answered: .* it is released"):
-        run_labeling(labeled.client, batch, np.random.default_rng(0), late, labeled.clock)
-    assert done == [1]
-
-
-def test_a_label_that_the_service_finds_fault_with_is_named_and_the_others_are_stored(
-    labeled: Loop, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    batch, before = labeled.acquire(20, "random"), labeled.project.label_watermark
-    wrong = [batch.items[3], batch.items[11]]
-    _spoil(monkeypatch, {(item.trajectory, item.start) for item in wrong})
-    with pytest.raises(Invalid) as caught:
-        run_labeling(labeled.client, batch, np.random.default_rng(0))
-    first, second = (f"segment {item.trajectory}:{item.start}" for item in wrong)
-    assert first in str(caught.value)
-    assert [second in note for note in caught.value.__notes__] == [True]
-    assert labeled.project.label_watermark == before + 18
-    answered = labeled.client.acquisition(batch.id)
-    assert [item.rank for item in answered.items if not item.labeled] == [3, 11]
-    assert (answered.status, labeled.project.counts.leased) == ("released", 0)
-
-
-def test_a_service_that_finds_fault_with_every_label_is_not_asked_about_each(
-    labeled: Loop, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    batch = labeled.acquire(100, "random")
-    _spoil(monkeypatch, {(item.trajectory, item.start) for item in batch.items})
-    sizes: list[int] = []
-    _measure(monkeypatch, labeled, sizes)
-    with pytest.raises(Invalid):
-        run_labeling(labeled.client, batch, np.random.default_rng(0))
-    assert len(sizes) < 60  # of 199 that it would take to have each stand alone
-    assert labeled.client.acquisition(batch.id).status == "released"
-
-
-def test_one_fault_does_not_spoil_a_later_request_where_many_spoiled_the_first(
-    labeled: Loop, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(delivery, "BATCH", 50)
-    batch, before = labeled.acquire(100, "random"), labeled.project.label_watermark
-    wrong = [*batch.items[:25], batch.items[70]]
-    _spoil(monkeypatch, {(item.trajectory, item.start) for item in wrong})
-    with pytest.raises(Invalid):
-        run_labeling(labeled.client, batch, np.random.default_rng(0))
-    assert labeled.project.label_watermark == before + 74
-
-
-def test_a_budget_that_others_spend_meanwhile_costs_no_answer_that_has_room(labeled: Loop) -> None:
-    batch, before = labeled.acquire(10, "random", lease_seconds=60), labeled.project.counts.labeled
-
-    def overslept(done: int, of: int) -> None:
-        if done == 1:
-            labeled.clock.advance(90)
-            labeled.change(label_budget=before + 5)
-
-    with pytest.raises(Conflict, match="budget"):
-        run_labeling(labeled.client, batch, np.random.default_rng(0), overslept, labeled.clock)
-    assert labeled.project.counts.labeled == before + 5
-    assert labeled.client.acquisition(batch.id).status == "released"
-
-
 def test_an_exploration_whose_episode_ends_early_is_given_back_and_the_others_are_stored(
     empty: Loop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -333,63 +223,6 @@ def test_an_exploration_whose_episode_ends_early_is_given_back_and_the_others_ar
     answered = empty.client.acquisition(batch.id)
     assert [item.rank for item in answered.items if not item.labeled] == [2]
     assert (answered.status, empty.project.budget.reserved) == ("released", 0)
-
-
-@pytest.mark.parametrize("how", ["released", "taken"])
-def test_a_lease_that_holds_nothing_any_more_is_found_out_by_one_question(
-    labeled: Loop, monkeypatch: pytest.MonkeyPatch, how: str
-) -> None:
-    monkeypatch.setattr(delivery, "BATCH", 20)
-    batch = labeled.acquire(50, "random", lease_seconds=60)
-
-    def overslept(done: int, of: int) -> None:
-        if done == of and how == "released":
-            labeled.client.release(batch.id, batch.token or 0)
-        elif done == of:
-            labeled.clock.advance(90)
-            labeled.acquire(of, "random")
-
-    sizes: list[int] = []
-    _measure(monkeypatch, labeled, sizes)
-    with pytest.raises(LeaseLost, match="the lease was lost while its"):
-        run_labeling(labeled.client, batch, np.random.default_rng(0), overslept, labeled.clock)
-    assert len(sizes) == len(range(0, len(batch.items), delivery.BATCH))  # none was halved
-
-
-def test_a_budget_without_room_for_one_label_is_not_asked_about_each(
-    labeled: Loop, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The lease had ended, and what it had reserved was spent by others meanwhile: but for five labels."""
-    batch = labeled.acquire(80, "random", lease_seconds=60)
-    before = labeled.project.counts.labeled
-
-    def overslept(done: int, of: int) -> None:
-        if done == of:
-            labeled.clock.advance(90)
-            labeled.change(label_budget=before + 5)
-
-    sizes: list[int] = []
-    _measure(monkeypatch, labeled, sizes)
-    with pytest.raises(Conflict, match="budget"):
-        run_labeling(labeled.client, batch, np.random.default_rng(0), overslept)
-    assert labeled.project.counts.labeled == before + 5
-    assert len(sizes) < 30
-
-
-def test_where_all_is_labeled_the_lease_is_asked_about_once(labeled: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
-    batch = labeled.acquire(10, "random", lease_seconds=60)
-    run_labeling(labeled.client, batch, np.random.default_rng(0))
-    labeled.clock.advance(90)
-    asked: list[object] = []
-    extend = labeled.client.extend
-
-    def counted(*args: Any) -> Acquisition:
-        asked.append(args)
-        return extend(*args)
-
-    monkeypatch.setattr(labeled.client, "extend", counted)
-    again = run_labeling(labeled.client, batch, np.random.default_rng(0), None, labeled.clock)
-    assert (again.created, again.duplicates, len(asked)) == (0, 10, 1)
 
 
 def test_explain_gives_nothing_where_even_the_best_action_misses() -> None:
@@ -440,21 +273,6 @@ def _measure(monkeypatch: pytest.MonkeyPatch, loop: Loop, sizes: list[int]) -> N
         return label(client, request)
 
     monkeypatch.setattr(Client, "label", measured)
-
-
-def _spoil(monkeypatch: pytest.MonkeyPatch, chosen: set[tuple[str, int]]) -> None:
-    """The chosen segments are answered with an action that the project does not have."""
-    request = delivery.Delivery._request
-
-    def spoilt(self: delivery.Delivery, answers: Any) -> LabelsRequest:
-        asked = request(self, answers)
-        changed = {"actions": [99], "action_sets": None}
-        items = [
-            item.model_copy(update=changed) if (item.trajectory, item.start) in chosen else item for item in asked.items
-        ]
-        return asked.model_copy(update={"items": items})
-
-    monkeypatch.setattr(delivery.Delivery, "_request", spoilt)
 
 
 def _end_episodes(monkeypatch: pytest.MonkeyPatch, batch: Acquisition, rank: int, after: int) -> None:

@@ -84,6 +84,14 @@ def always_keep(loop: Loop) -> None:
     loop.worker = loop.another_worker(loop.settings.model_copy(update=ALWAYS))
 
 
+def interrupted(loop: Loop, slices: Slices) -> Round:
+    """A round whose worker is stopped after six slices, with a checkpoint."""
+    asked = loop.client.start_round(loop.project.id)
+    slices.after = {6: loop.worker.stopping.set}
+    run_next(loop.worker)
+    return asked
+
+
 def crash() -> None:
     raise OSError(5, "Input/output error")
 
@@ -93,9 +101,7 @@ def whole(kind: str) -> list[tuple[str, int]]:
 
 
 def test_a_stopping_worker_loses_no_step(labeled: Loop, slices: Slices, undisturbed: dict[str, str]) -> None:
-    asked = labeled.client.start_round(labeled.project.id)
-    slices.after = {6: labeled.worker.stopping.set}
-    run_next(labeled.worker)
+    asked = interrupted(labeled, slices)
     assert (job_of(labeled).state, job_of(labeled).attempts) == ("queued", 0)
     assert row_of(labeled).checkpoint_stage == "world_model"
     assert len(checkpoints(labeled)) == 1
@@ -146,9 +152,7 @@ def test_without_progress_the_attempts_run_out(labeled: Loop, slices: Slices) ->
 def test_a_checkpoint_that_is_no_use_starts_the_stage_anew(
     labeled: Loop, slices: Slices, undisturbed: dict[str, str], damage: str
 ) -> None:
-    asked = labeled.client.start_round(labeled.project.id)
-    slices.after = {6: labeled.worker.stopping.set}
-    run_next(labeled.worker)
+    asked = interrupted(labeled, slices)
     (path,) = checkpoints(labeled)
     if damage == "torn":
         path.write_bytes(path.read_bytes()[:1000])
@@ -251,9 +255,7 @@ def test_a_checkpoint_of_another_network_or_of_other_data_starts_the_stage_anew(
     labeled: Loop, slices: Slices, undisturbed: dict[str, str], other: str
 ) -> None:
     """As after an upgrade between two attempts: what cannot be loaded shall not fail every attempt."""
-    asked = labeled.client.start_round(labeled.project.id)
-    slices.after = {6: labeled.worker.stopping.set}
-    run_next(labeled.worker)
+    asked = interrupted(labeled, slices)
     kept = row_of(labeled).checkpoint_sha256
     assert kept is not None
     state = TrainingState.from_bytes(labeled.blobs.get("checkpoints", kept))

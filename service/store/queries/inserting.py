@@ -3,7 +3,7 @@
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
-from service.store.tables import Row
+from service.store.columns import Row
 
 
 def insert(session: Session, row: type[Row]) -> postgresql.Insert | sqlite.Insert:

@@ -3,7 +3,7 @@
 import sqlalchemy as sa
 from alembic import op
 
-import service.store.tables
+import service.store.columns
 
 revision = "0001"
 down_revision = None
@@ -18,7 +18,7 @@ def upgrade() -> None:
         sa.Column("name", sa.String(length=200), nullable=False),
         sa.Column("secret_sha256", sa.String(length=64), nullable=False),
         sa.Column("scopes", sa.JSON(none_as_null=True), nullable=False),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_api_key")),
     )
     op.create_table(
@@ -27,7 +27,7 @@ def upgrade() -> None:
         sa.Column("project_id", sa.Uuid(), nullable=True),
         sa.Column("kind", sa.String(length=60), nullable=False),
         sa.Column("data", sa.JSON(none_as_null=True), nullable=False),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_event")),
     )
     with op.batch_alter_table("event", schema=None) as batch_op:
@@ -49,7 +49,7 @@ def upgrade() -> None:
         sa.Column("labels_at_round", sa.Integer(), nullable=False),
         sa.Column("pool_labels", sa.Integer(), nullable=False),
         sa.Column("token", sa.Integer(), nullable=False),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_project")),
         sa.UniqueConstraint("name", name=op.f("uq_project_name")),
     )
@@ -60,14 +60,14 @@ def upgrade() -> None:
         sa.Column("transitions", sa.Integer(), nullable=False),
         sa.Column("streams", sa.JSON(none_as_null=True), nullable=False),
         sa.Column("bytes", sa.Integer(), nullable=False),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_trajectory")),
     )
     op.create_table(
         "worker",
         sa.Column("owner", sa.String(length=120), nullable=False),
         sa.Column("queues", sa.JSON(none_as_null=True), nullable=False),
-        sa.Column("heartbeat_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("heartbeat_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.PrimaryKeyConstraint("owner", name=op.f("pk_worker")),
     )
     op.create_table(
@@ -81,8 +81,8 @@ def upgrade() -> None:
         sa.Column("status", sa.String(length=10), nullable=False),
         sa.Column("labeler", sa.String(length=200), nullable=False),
         sa.Column("token", sa.Integer(), nullable=False),
-        sa.Column("lease_expires_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("lease_expires_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.ForeignKeyConstraint(["project_id"], ["project.id"], name=op.f("fk_acquisition_project_id_project")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_acquisition")),
     )
@@ -97,7 +97,7 @@ def upgrade() -> None:
         sa.Column("acquisition_id", sa.Uuid(), nullable=False),
         sa.Column("purpose", sa.String(length=10), nullable=False),
         sa.Column("token", sa.Integer(), nullable=False),
-        sa.Column("expires_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("expires_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.ForeignKeyConstraint(["project_id"], ["project.id"], name=op.f("fk_claim_project_id_project")),
         sa.PrimaryKeyConstraint("project_id", "trajectory_id", "start", name=op.f("pk_claim")),
     )
@@ -119,18 +119,18 @@ def upgrade() -> None:
         sa.Column("fence", sa.Integer(), nullable=False),
         sa.Column("attempts", sa.Integer(), nullable=False),
         sa.Column("max_attempts", sa.Integer(), nullable=False),
-        sa.Column("lease_until", service.store.tables.UtcDateTime(timezone=True), nullable=True),
-        sa.Column("heartbeat_at", service.store.tables.UtcDateTime(timezone=True), nullable=True),
-        sa.Column("not_before", service.store.tables.UtcDateTime(timezone=True), nullable=True),
-        sa.Column("sent_at", service.store.tables.UtcDateTime(timezone=True), nullable=True),
+        sa.Column("lease_until", service.store.columns.UtcDateTime(timezone=True), nullable=True),
+        sa.Column("heartbeat_at", service.store.columns.UtcDateTime(timezone=True), nullable=True),
+        sa.Column("not_before", service.store.columns.UtcDateTime(timezone=True), nullable=True),
+        sa.Column("sent_at", service.store.columns.UtcDateTime(timezone=True), nullable=True),
         sa.Column("checkpoint_sha256", sa.String(length=64), nullable=True),
         sa.Column("progress", sa.Double(), nullable=False),
         sa.Column("message", sa.String(), nullable=False),
         sa.Column("result", sa.JSON(none_as_null=True), nullable=False),
         sa.Column("error", sa.String(), nullable=True),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
-        sa.Column("started_at", service.store.tables.UtcDateTime(timezone=True), nullable=True),
-        sa.Column("finished_at", service.store.tables.UtcDateTime(timezone=True), nullable=True),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("started_at", service.store.columns.UtcDateTime(timezone=True), nullable=True),
+        sa.Column("finished_at", service.store.columns.UtcDateTime(timezone=True), nullable=True),
         sa.ForeignKeyConstraint(["project_id"], ["project.id"], name=op.f("fk_job_project_id_project")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_job")),
     )
@@ -153,7 +153,7 @@ def upgrade() -> None:
         sa.Column("source", sa.JSON(none_as_null=True), nullable=False),
         sa.Column("acquisition_id", sa.Uuid(), nullable=True),
         sa.Column("watermark", sa.Integer(), nullable=False),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.ForeignKeyConstraint(["project_id"], ["project.id"], name=op.f("fk_label_project_id_project")),
         sa.ForeignKeyConstraint(["trajectory_id"], ["trajectory.id"], name=op.f("fk_label_trajectory_id_trajectory")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_label")),
@@ -170,7 +170,7 @@ def upgrade() -> None:
         sa.Column("split", sa.String(length=10), nullable=False),
         sa.Column("segments", sa.Integer(), nullable=False),
         sa.Column("provenance_sha256", sa.String(length=64), nullable=True),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.ForeignKeyConstraint(["project_id"], ["project.id"], name=op.f("fk_membership_project_id_project")),
         sa.ForeignKeyConstraint(
             ["trajectory_id"], ["trajectory.id"], name=op.f("fk_membership_trajectory_id_trajectory")
@@ -192,8 +192,8 @@ def upgrade() -> None:
         sa.Column("model_error", sa.JSON(none_as_null=True), nullable=True),
         sa.Column("job_id", sa.Uuid(), nullable=True),
         sa.Column("error", sa.String(), nullable=True),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
-        sa.Column("finished_at", service.store.tables.UtcDateTime(timezone=True), nullable=True),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("finished_at", service.store.columns.UtcDateTime(timezone=True), nullable=True),
         sa.ForeignKeyConstraint(["project_id"], ["project.id"], name=op.f("fk_round_project_id_project")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_round")),
     )
@@ -232,7 +232,7 @@ def upgrade() -> None:
         sa.Column("bytes", sa.Integer(), nullable=False),
         sa.Column("watermark", sa.Integer(), nullable=False),
         sa.Column("metrics", sa.JSON(none_as_null=True), nullable=False),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.ForeignKeyConstraint(["project_id"], ["project.id"], name=op.f("fk_model_version_project_id_project")),
         sa.ForeignKeyConstraint(["round_id"], ["round.id"], name=op.f("fk_model_version_round_id_round")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_model_version")),
@@ -251,7 +251,7 @@ def upgrade() -> None:
         sa.Column("memberships", sa.Integer(), nullable=False),
         sa.Column("shards", sa.Integer(), nullable=False),
         sa.Column("selections", sa.Integer(), nullable=False),
-        sa.Column("created_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("created_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.ForeignKeyConstraint(["project_id"], ["project.id"], name=op.f("fk_scoring_project_id_project")),
         sa.ForeignKeyConstraint(["round_id"], ["round.id"], name=op.f("fk_scoring_round_id_round")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_scoring")),

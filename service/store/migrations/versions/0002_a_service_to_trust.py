@@ -3,7 +3,7 @@
 import sqlalchemy as sa
 from alembic import op
 
-import service.store.tables
+import service.store.columns
 
 revision = "0002"
 down_revision = "0001"
@@ -29,7 +29,7 @@ def upgrade() -> None:
         sa.Column("status", sa.Integer(), nullable=True),
         sa.Column("location", sa.String(length=200), nullable=True),
         sa.Column("body", sa.String(), nullable=True),
-        sa.Column("expires_at", service.store.tables.UtcDateTime(timezone=True), nullable=False),
+        sa.Column("expires_at", service.store.columns.UtcDateTime(timezone=True), nullable=False),
         sa.PrimaryKeyConstraint("caller", "route", "key", name=op.f("pk_idempotency")),
     )
     op.create_index(op.f("ix_idempotency_expires_at"), "idempotency", ["expires_at"])
@@ -80,7 +80,7 @@ def _add_nullable() -> None:
     for table, name, length in TEXTS:
         op.add_column(table, sa.Column(name, sa.String(length=length), nullable=True))
     op.add_column("event", sa.Column("transaction", sa.BigInteger(), nullable=True))
-    op.add_column("queue", sa.Column("leased_until", service.store.tables.UtcDateTime(timezone=True), nullable=True))
+    op.add_column("queue", sa.Column("leased_until", service.store.columns.UtcDateTime(timezone=True), nullable=True))
     op.add_column("acquisition", sa.Column("reason", sa.String(), nullable=True))
     op.add_column("acquisition_item", sa.Column("actions", sa.JSON(none_as_null=True), nullable=True))
     op.add_column("acquisition_item", sa.Column("answer", sa.String(length=64), nullable=True))
