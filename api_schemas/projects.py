@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from api_schemas.base import Schema, Timestamp
 from api_schemas.environments import Environment, Spaces, bounded_grid, takes_grid
-from api_schemas.strategies import DEFAULT_STRATEGY, StrategyName
+from api_schemas.strategies import DEFAULT_BATCH_RULE, DEFAULT_STRATEGY, BatchRuleName, StrategyName
 
 Family = Literal["grid"]
 
@@ -17,11 +17,11 @@ class LabelingPolicy(Schema):
 
     round_labels: a round starts by itself after this many new pool labels; 0 turns that off.
     label_budget: pool labels that the project may spend in all; None is no limit.
-    diversify: order the ranked queue so that every prefix of it is a diverse batch.
+    batch_rule: how scored segments become a queue, every prefix of which is a batch; "top" is the plain order by score.
     """
 
     strategy: StrategyName = DEFAULT_STRATEGY
-    diversify: bool = True
+    batch_rule: BatchRuleName = DEFAULT_BATCH_RULE
     round_labels: int = Field(default=100, ge=0)
     label_budget: int | None = Field(default=None, ge=1)
     lease_seconds: float = Field(default=3600.0, gt=0, le=30 * 86400)
@@ -65,7 +65,7 @@ class ProjectPatch(Schema):
     """Fields that are left out stay as they are."""
 
     strategy: StrategyName | None = None
-    diversify: bool | None = None
+    batch_rule: BatchRuleName | None = None
     round_labels: int | None = Field(default=None, ge=0)
     label_budget: int | None = Field(default=None, ge=1)
     lease_seconds: float | None = Field(default=None, gt=0, le=30 * 86400)

@@ -17,13 +17,15 @@ class RoundCreate(Schema):
 class ModelError(Schema):
     """Error on the project's labeled held-out segments.
 
-    loss: next-state loss, summed nats a transition. dynamics_accuracy: share of the elements that changed that are
-    predicted right. by_group: the same by action group (movement, interaction). inverse_accuracy counts an action as
-    right when it is among those that explain the step. None: no such transition in the held-out set.
+    loss: next-state loss, summed nats a transition. exact_accuracy: share of transitions whose whole next observation
+    is predicted right; None in rounds from before it was measured. dynamics_accuracy: share of changed elements
+    that are predicted right. by_group: the same by action group (movement, interaction). inverse_accuracy counts an
+    action as right when it is among those that explain the step. None: no such transition in the held-out set.
     """
 
     transitions: int
     loss: float | None
+    exact_accuracy: float | None = None
     dynamics_accuracy: float | None
     inverse_accuracy: float | None
     by_group: dict[str, "GroupError"] = {}
@@ -34,8 +36,92 @@ class GroupError(Schema):
 
     transitions: int
     loss: float | None
+    exact_accuracy: float | None = None
     dynamics_accuracy: float | None
     inverse_accuracy: float | None
+
+
+class Mask(Schema):
+    """How many coordinates of an observation the inverse model reads, on average, and how many there are.
+
+    On grids these are the cells and what is carried.
+    """
+
+    kept: float
+    coordinates: int
+
+
+class Support(Schema):
+    """How far what the inverse model reads of pool segments lies from what it reads of the nearest labeled one.
+
+    outside: share of segments that differ from every label. Distances count the codes that differ: on grids the
+    object, colour and state of each element, before and after.
+    """
+
+    outside: float
+    mean: float
+    percentile_95: float
+
+
+class Aliasing(Schema):
+    """Entropy of the inferred actions over the pool, in nats. above_ln_2: share in more doubt than between two."""
+
+    mean: float
+    percentile_95: float
+    above_ln_2: float
+
+
+class BackAction(Schema):
+    """Share of held-out actions inferred wrong, where what the inverse model does not read is near to labels and far.
+
+    nearest, farthest: in the first and last third of the distances. spearman: of distance and error.
+    """
+
+    steps: int
+    nearest: float
+    farthest: float
+    spearman: float | None
+
+
+class Ranking(Schema):
+    """Rank correlation of the cycle's score with the true loss on held-out segments; None where nothing ranks."""
+
+    segments: int
+    spearman: float | None
+    kendall: float | None
+
+
+class KnownAction(Schema):
+    """What is known of one action, over the steps that it alone explains.
+
+    labels: such steps in the training set, held_out: in the held-out set. accuracy: share of those inferred right.
+    """
+
+    action: int
+    name: str
+    labels: int
+    held_out: int
+    accuracy: float | None
+
+
+class Diagnostics(Schema):
+    """Whether the method holds in this round: the four conditions it rests on, and whether its score ranks.
+
+    sampled: segments of the pool that were looked at. None: nothing to look at, or no held-out labels.
+    back_action_in_support: over the steps of which a label shows the inverse model the same. warnings: what is wrong,
+    in sentences; empty where nothing is.
+    """
+
+    sampled: int
+    mask: Mask | None
+    support: Support | None
+    aliasing: Aliasing | None
+    back_action: BackAction | None
+    back_action_in_support: BackAction | None
+    ranking: Ranking | None
+    ranking_by_group: dict[str, Ranking] = {}
+    actions: list[KnownAction]
+    warnings: list[str]
 
 
 class Stage(Schema):
@@ -57,6 +143,7 @@ class Round(Schema):
     stages: list[Stage]
     models: dict[str, UUID]
     model_error: ModelError | None
+    diagnostics: Diagnostics | None = None
     job: UUID | None
     error: str | None
     created_at: Timestamp

@@ -1,17 +1,38 @@
-"""Names of the acquisition strategies. A contract test holds them equal to models.acquisition.STRATEGIES."""
+"""Names of the strategies and batch rules. A contract test holds them equal to models.acquisition's registries."""
 
 from typing import Literal, get_args
 
 from api_schemas.base import Schema
 
-StrategyName = Literal["random", "cycle", "vanilla_cycle", "uncertainty"]
+StrategyName = Literal[
+    "random",
+    "cycle",
+    "masked_cycle",
+    "vanilla_cycle",
+    "self_inverse",
+    "uncertainty",
+    "progress",
+    "fidelity",
+    "reachability",
+    "forward_cycle",
+    "true_progress",
+    "oracle",
+    "oracle_easy",
+    "oracle_uniform",
+]
+BatchRuleName = Literal["top", "rank_noise", "kmeans_plus_plus", "k_center", "signatures"]
+BATCH_RULE_NAMES: tuple[str, ...] = get_args(BatchRuleName)
+DEFAULT_BATCH_RULE: BatchRuleName = "kmeans_plus_plus"
 DEFAULT_STRATEGY: StrategyName = "cycle"
 COLD_START_STRATEGY: StrategyName = "random"
 STRATEGY_NAMES: tuple[str, ...] = get_args(StrategyName)
 
 
 class Strategy(Schema):
-    """`privileged` strategies see hidden actions: benchmarks only. `needs` names the networks a round trains for it."""
+    """`privileged` strategies see hidden actions: benchmarks only, a project is refused them.
+
+    `needs` names the networks that it reads: the round trains them, but for the previous round's world model.
+    """
 
     name: StrategyName
     privileged: bool
@@ -19,24 +40,52 @@ class Strategy(Schema):
     summary: str
 
 
+def _strategy(name: StrategyName, needs: tuple[str, ...], summary: str, *, privileged: bool = False) -> Strategy:
+    return Strategy(name=name, privileged=privileged, needs=needs, summary=summary)
+
+
+_CYCLE = ("inverse_dynamics", "world_model")
 CATALOG: tuple[Strategy, ...] = (
-    Strategy(name="random", privileged=False, needs=(), summary="Segments in uniformly random order; needs no model."),
-    Strategy(
-        name="cycle",
-        privileged=False,
-        needs=("inverse_dynamics", "world_model"),
-        summary="Forward-inverse cycle error under the sparse inverse model (equation 7).",
+    _strategy("random", (), "Segments in uniformly random order; needs no model."),
+    _strategy("cycle", _CYCLE, "Forward-inverse cycle error under the sparse inverse model (equation 7)."),
+    _strategy(
+        "masked_cycle",
+        ("masked_inverse_dynamics", "world_model"),
+        "The same cycle error under an inverse model that learns what to look at.",
     ),
-    Strategy(
-        name="vanilla_cycle",
-        privileged=False,
-        needs=("dense_inverse_dynamics", "world_model"),
-        summary="The same cycle error under an inverse model that sees the whole observation.",
+    _strategy(
+        "vanilla_cycle",
+        ("dense_inverse_dynamics", "world_model"),
+        "The same cycle error under an inverse model that sees the whole observation.",
     ),
-    Strategy(
-        name="uncertainty",
-        privileged=False,
-        needs=("ensemble", "inverse_dynamics", "world_model"),
-        summary="Disagreement of an ensemble of world models under the inferred action.",
+    _strategy("self_inverse", ("world_model",), "Cycle error with the world model as its own inverse: a control."),
+    _strategy(
+        "uncertainty",
+        ("ensemble", "inverse_dynamics"),
+        "Disagreement of an ensemble of world models under the inferred action.",
     ),
+    _strategy(
+        "progress",
+        ("inverse_dynamics", "previous_world_model", "world_model"),
+        "How much the loss under the inferred action fell since the round before; in the first round the loss itself.",
+    ),
+    _strategy(
+        "fidelity",
+        ("inverse_dynamics", "subgoal_generator", "world_model"),
+        "Distance from the prediction to the nearest of several samples of the subgoal generator.",
+    ),
+    _strategy(
+        "reachability", _CYCLE, "How little the inverse model recognises the action in what it is predicted to do."
+    ),
+    _strategy("forward_cycle", _CYCLE, "The forward-first cycle: predict under every action, then recover the action."),
+    _strategy(
+        "true_progress",
+        ("previous_world_model", "world_model"),
+        "Progress under the true actions.",
+        privileged=True,
+    ),
+    _strategy("oracle", ("world_model",), "The true loss, hardest first.", privileged=True),
+    _strategy("oracle_easy", ("world_model",), "The true loss, easiest first.", privileged=True),
+    _strategy("oracle_uniform", ("world_model",), "Ten intervals of the true loss by turns.", privileged=True),
 )
+PRIVILEGED: frozenset[str] = frozenset(strategy.name for strategy in CATALOG if strategy.privileged)

@@ -11,7 +11,7 @@ from api_schemas.acquisitions import Acquisition
 from api_schemas.events import Event
 from api_schemas.jobs import Job
 from api_schemas.projects import Project
-from api_schemas.rounds import ModelError, ModelErrorCurve
+from api_schemas.rounds import ModelError, ModelErrorCurve, Round
 
 WIDTH_WITHOUT_TERMINAL = 200
 TEXT = ("id", "trajectory", "environment", "strategy", "actions", "kind", "state", "message", "error")
@@ -59,8 +59,18 @@ def job_table(jobs: Sequence[Job]) -> Table:
 def event_line(event: Event) -> str:
     """Time, who, what, and what there is to know about it, on one line."""
     moment = event.created_at.astimezone(UTC)
-    line = f"{moment:%Y-%m-%d %H:%M:%S}Z {event.actor or '-'} {event.kind} {json.dumps(event.data, ensure_ascii=False)}"
-    return "".join(each if each.isprintable() else f"\\u{ord(each):04x}" for each in line)
+    return _printable(
+        f"{moment:%Y-%m-%d %H:%M:%S}Z {event.actor or '-'} {event.kind} {json.dumps(event.data, ensure_ascii=False)}"
+    )
+
+
+def warning_lines(name: str, shown: Round) -> list[str]:
+    """What the diagnostics of the project's round warn of, one line each; none where nothing is wrong or was looked at.
+
+    name: of the project.
+    """
+    warnings = [] if shown.diagnostics is None else shown.diagnostics.warnings
+    return [_printable(f"{name}, round {shown.number}: {sentence}") for sentence in warnings]
 
 
 def error_table(curves: Mapping[str, ModelErrorCurve], first_column: str = "project") -> Table:
@@ -75,6 +85,11 @@ def error_table(curves: Mapping[str, ModelErrorCurve], first_column: str = "proj
             last = point is curve.points[-1]
             table.add_row(name, str(point.labels), *_error_cells(point.model_error, accuracies[1:]), end_section=last)
     return table
+
+
+def _printable(line: str) -> str:
+    """What users typed may hold control characters; a terminal would obey them."""
+    return "".join(each if each.isprintable() else f"\\u{ord(each):04x}" for each in line)
 
 
 def _error_cells(error: ModelError, groups: Sequence[str]) -> list[str]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.inverse_dynamics.base import InverseDynamics
+from models.inverse_dynamics.base import ActionInference
 from models.segments import Observations, first, future
 from models.subgoal_generators.base import SubgoalGenerator
 from models.world_models.base import WorldModel
@@ -24,7 +24,7 @@ class WorstChain:
 
 
 @torch.inference_mode()  # scores are compared, never differentiated
-def cycle(world_model: WorldModel, inverse_dynamics: InverseDynamics, chain: Observations) -> tuple[Tensor, Tensor]:
+def cycle(world_model: WorldModel, inverse_dynamics: ActionInference, chain: Observations) -> tuple[Tensor, Tensor]:
     """Inferred actions (B, K) and cycle error (B,) of chains (B, K+1, ...), observed or generated."""
     actions = inverse_dynamics.infer(chain)  # (5)
     state = world_model.infer_state(first(chain))
@@ -32,14 +32,14 @@ def cycle(world_model: WorldModel, inverse_dynamics: InverseDynamics, chain: Obs
     return actions, world_model.distance(prediction, future(chain))  # (7)
 
 
-def cycle_error(world_model: WorldModel, inverse_dynamics: InverseDynamics, chain: Observations) -> Tensor:
+def cycle_error(world_model: WorldModel, inverse_dynamics: ActionInference, chain: Observations) -> Tensor:
     """L_cyc = sum_i l(z~_{t+i}, z^_{t+i}) of each chain (B, K+1, ...) -> (B,)."""
     return cycle(world_model, inverse_dynamics, chain)[1]
 
 
 def worst_chain(
     world_model: WorldModel,
-    inverse_dynamics: InverseDynamics,
+    inverse_dynamics: ActionInference,
     subgoal_generator: SubgoalGenerator,
     observations: Observations,
     chains: int,
@@ -61,7 +61,7 @@ def worst_chain(
 
 def _sampled(
     world_model: WorldModel,
-    inverse_dynamics: InverseDynamics,
+    inverse_dynamics: ActionInference,
     subgoal_generator: SubgoalGenerator,
     observations: Observations,
     horizon: int,

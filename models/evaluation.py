@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from models.inverse_dynamics.base import InverseDynamics
-from models.segments import SegmentBatch, at, first, future
+from models.segments import Observations, SegmentBatch, at, first, future
 from models.world_models.base import WorldModel
 
 
@@ -18,11 +18,13 @@ class GroupError:
 
     next_state_loss: distance of one-step predictions, mean over transitions (grid: nats summed over the observation).
     dynamics_accuracy: changed elements predicted right / changed elements, pooled over transitions.
+    exact_accuracy: share of transitions whose likeliest prediction is the whole next observation.
     inverse_accuracy: share of transitions whose inferred action is in the label's action set.
     """
 
     transitions: int
     next_state_loss: float | None
+    exact_accuracy: float | None
     dynamics_accuracy: float | None
     inverse_accuracy: float | None
 
@@ -37,9 +39,11 @@ class ModelError:
 
 @dataclass(frozen=True)
 class TransitionErrors:
-    """Per transition (N,): distance, changed elements predicted right, changed elements, inferred action right."""
+    """Per transition (N,): distance, whole next observation predicted right, changed elements predicted right, changed
+    elements, inferred action right."""
 
     distance: Tensor
+    exact: Tensor
     correct: Tensor
     changed: Tensor
     inverse_correct: Tensor | None
@@ -52,6 +56,7 @@ class TransitionErrors:
         return GroupError(
             transitions=count,
             next_state_loss=float(self.distance[members].double().mean()) if count else None,
+            exact_accuracy=float(self.exact[members].double().mean()) if count else None,
             dynamics_accuracy=int(self.correct[members].sum()) / changed if changed else None,
             inverse_accuracy=float(inverse[members].double().mean()) if count and inverse is not None else None,
         )
@@ -97,6 +102,7 @@ def transition_errors(
     inverse = [part.inverse_correct for part in parts if part.inverse_correct is not None]
     return TransitionErrors(
         distance=torch.cat([part.distance for part in parts]),
+        exact=torch.cat([part.exact for part in parts]),
         correct=torch.cat([part.correct for part in parts]),
         changed=torch.cat([part.changed for part in parts]),
         inverse_correct=torch.cat(inverse) if inverse else None,
@@ -106,13 +112,19 @@ def transition_errors(
 def _errors(world_model: WorldModel, pairs: SegmentBatch, inverse_dynamics: InverseDynamics | None) -> TransitionErrors:
     actions: Any = pairs.actions
     prediction = world_model.rollout(world_model.infer_state(first(pairs.observations)), actions)
-    correct, changed = world_model.changes(at({"state": prediction}, 0)["state"], pairs.observations)
+    correct, changed = world_model.changes(prediction[:, 0], pairs.observations)
     return TransitionErrors(
         distance=world_model.distance(prediction, future(pairs.observations)),
+        exact=_equal(world_model.observe(prediction[:, 0]), at(pairs.observations, 1)),
         correct=correct,
         changed=changed,
         inverse_correct=None if inverse_dynamics is None else _recovered(inverse_dynamics, pairs),
     )
+
+
+def _equal(left: Observations, right: Observations) -> Tensor:
+    """Whether whole observations (N, ...) are equal -> bool (N,)."""
+    return torch.stack([(left[name] == right[name]).flatten(1).all(1) for name in right]).all(0)
 
 
 def _recovered(inverse_dynamics: InverseDynamics, pairs: SegmentBatch) -> Tensor:

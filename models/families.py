@@ -7,6 +7,11 @@ from typing import Any, Literal, Protocol
 import torch
 
 from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.inverse_dynamics.gates import (
+    GridCellMaskedInverseDynamics,
+    GridLatentMaskedInverseDynamics,
+    MaskedInverseDynamicsConfig,
+)
 from models.inverse_dynamics.grid import (
     DenseInverseDynamicsConfig,
     GridDenseInverseDynamics,
@@ -33,6 +38,8 @@ __all__ = [
     "family_named",
 ]
 
+InverseKind = Literal["sparse", "dense", "masked"]
+
 
 class Family(Protocol):
     """Builds the networks of one kind of environment. A config of None is the family's default."""
@@ -47,7 +54,7 @@ class Family(Protocol):
     def build_world_model(self, spaces: Spaces, config: Any, generator: torch.Generator) -> WorldModel: ...
 
     def build_inverse_dynamics(
-        self, spaces: Spaces, kind: Literal["sparse", "dense"], config: Any, generator: torch.Generator
+        self, spaces: Spaces, kind: InverseKind, config: Any, generator: torch.Generator
     ) -> DiscreteInverseDynamics: ...
 
     def build_subgoal_generator(self, spaces: Spaces, config: Any, generator: torch.Generator) -> SubgoalGenerator: ...
@@ -93,8 +100,8 @@ class GridFamily:
     def build_inverse_dynamics(
         self,
         spaces: Spaces,
-        kind: Literal["sparse", "dense"],
-        config: SparseInverseDynamicsConfig | DenseInverseDynamicsConfig | None,
+        kind: InverseKind,
+        config: SparseInverseDynamicsConfig | DenseInverseDynamicsConfig | MaskedInverseDynamicsConfig | None,
         generator: torch.Generator,
     ) -> DiscreteInverseDynamics:
         """All parameters are drawn from `generator`. Raises ValueError for a kind or config that does not fit."""
@@ -103,7 +110,13 @@ class GridFamily:
             return GridSparseInverseDynamics(spaces, config or SparseInverseDynamicsConfig(), generator)
         if kind == "dense" and isinstance(config, DenseInverseDynamicsConfig | None):
             return GridDenseInverseDynamics(spaces, config or DenseInverseDynamicsConfig(), generator)
-        raise ValueError(f"Grid inverse dynamics is 'sparse' or 'dense' with its config, got {kind!r} and {config}.")
+        if kind == "masked" and isinstance(config, MaskedInverseDynamicsConfig | None):
+            config = config or MaskedInverseDynamicsConfig()
+            if config.over == "cells":
+                return GridCellMaskedInverseDynamics(spaces, config, generator)
+            return GridLatentMaskedInverseDynamics(spaces, config, generator)
+        names = "'sparse', 'dense' or 'masked'"
+        raise ValueError(f"Grid inverse dynamics is {names} with its config, got {kind!r} and {config}.")
 
     def build_subgoal_generator(
         self, spaces: Spaces, config: GridSubgoalGeneratorConfig | None, generator: torch.Generator
@@ -123,6 +136,9 @@ class GridFamily:
             case "dense_inverse_dynamics":
                 dense = DenseInverseDynamicsConfig(**config)
                 return self.build_inverse_dynamics(spaces, "dense", dense, generator)
+            case "masked_inverse_dynamics":
+                masked = MaskedInverseDynamicsConfig(**config)
+                return self.build_inverse_dynamics(spaces, "masked", masked, generator)
             case "subgoal_generator":
                 return self.build_subgoal_generator(spaces, GridSubgoalGeneratorConfig(**config), generator)
         raise ValueError(f"The grid family builds {', '.join(KINDS)}; got {kind!r}.")
@@ -137,6 +153,8 @@ class GridFamily:
                 return TrainingConfig(steps=400, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
             case "dense_inverse_dynamics":
                 return TrainingConfig(steps=400, batch_size=64, learning_rate=3e-3, weight_decay=1e-3)
+            case "masked_inverse_dynamics":
+                return TrainingConfig(steps=800, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
             case "subgoal_generator":
                 return TrainingConfig(steps=1500, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
         raise ValueError(f"The grid family trains {', '.join(KINDS)}; got {kind!r}.")

@@ -9,7 +9,10 @@ from torch import Tensor, nn
 from models.segments import SegmentBatch
 from models.spaces import Spaces
 
-KINDS = ("world_model", "inverse_dynamics", "dense_inverse_dynamics", "subgoal_generator")
+KINDS = (
+    *("world_model", "inverse_dynamics", "dense_inverse_dynamics", "masked_inverse_dynamics"),
+    *("subgoal_generator",),
+)
 
 
 class Network(Protocol):

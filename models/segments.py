@@ -95,6 +95,16 @@ class SegmentBatch:
             segments=tuple(names),
         )
 
+    def with_drawn_actions(self, generator: torch.Generator) -> "SegmentBatch":
+        """The same segments, each step's action one of its set, all equally likely: all of them are true.
+
+        Without action sets the actions stay.
+        """
+        if self.action_sets is None:
+            return self
+        draw = torch.rand(self.action_sets.shape, generator=generator, device=generator.device)
+        return replace(self, actions=(draw.to(self.action_sets.device) * self.action_sets).argmax(-1))
+
     def without_labels(self) -> "SegmentBatch":
         """The observations alone, as a subgoal generator may see them."""
         return SegmentBatch(self.observations, segments=self.segments)

@@ -55,7 +55,7 @@ def acquire(session: Session, request: AcquireRequest, clock: Clock, limits: sco
     Whoever asks at the same time reads other rows of the queue (SKIP LOCKED); under the project's lock, which all take
     one after the other for the short rest, nothing is given out that another has taken meanwhile. What time it is, too,
     is asked under the lock: waiting for it takes time.
-    Raises UnknownResource, UnknownStrategy, PoolExhausted, BudgetExhausted.
+    Raises UnknownResource, UnknownStrategy, PrivilegedStrategy, PoolExhausted, BudgetExhausted.
     """
     project = projects.find(session, request.project)
     requested = _known(request.strategy or projects.policy_of(project).strategy)
@@ -118,6 +118,7 @@ def _told(
 def _known(strategy: str) -> str:
     if strategy not in STRATEGY_NAMES:
         raise UnknownStrategy("strategy", strategy, f"must be one of {', '.join(STRATEGY_NAMES)}")
+    projects.refuse_privileged("strategy", strategy)
     return strategy
 
 

@@ -57,6 +57,17 @@ class UnknownStrategy(InvalidField):
     """No strategy has this name."""
 
 
+class PrivilegedStrategy(ServiceError):
+    """The strategy looks at the labels that it is to choose."""
+
+    status_code = 403
+
+    def __init__(self, name: str, strategy: str) -> None:
+        reason = "needs the hidden actions of the pool, which only a benchmark has; a project cannot use it"
+        params = [InvalidParam(name=name, reason=reason, value=strategy)]
+        super().__init__(f"{name}: {strategy!r} {reason}", params)
+
+
 class UnknownBehavior(InvalidField):
     """The simulator has no behavior of this name."""
 

@@ -9,8 +9,9 @@ from sqlalchemy.orm import Session
 
 from api_schemas.environments import Environment, Spaces
 from api_schemas.projects import Budget, LabelingPolicy, PoolCounts, Project, ProjectCreate, ProjectPatch
+from api_schemas.strategies import PRIVILEGED
 from service import events
-from service.errors import NameTaken, UnknownResource
+from service.errors import NameTaken, PrivilegedStrategy, UnknownResource
 from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
 from service.store.queries import rows
@@ -19,7 +20,8 @@ from service.store.tables import ProjectRow
 
 
 def create(session: Session, request: ProjectCreate, now: datetime) -> ProjectRow:
-    """A new project. Raises NameTaken."""
+    """A new project. Raises NameTaken, PrivilegedStrategy."""
+    refuse_privileged("policy.strategy", request.policy.strategy)
     if pool_queries.project_named(session, request.name) is not None:
         raise NameTaken(request.name)
     row = ProjectRow(
@@ -52,13 +54,24 @@ def find(session: Session, project_id: UUID, *, lock: bool = False) -> ProjectRo
 
 
 def change(session: Session, project_id: UUID, patch: ProjectPatch, now: datetime) -> ProjectRow:
-    """Change the labeling policy; fields that were not sent stay. A null label_budget lifts the budget."""
+    """Change the labeling policy; fields that were not sent stay. A null label_budget lifts the budget.
+
+    Raises PrivilegedStrategy.
+    """
+    if patch.strategy is not None:
+        refuse_privileged("strategy", patch.strategy)
     row = find(session, project_id, lock=True)
     sent = patch.model_dump(exclude_unset=True)
     changes = {name: value for name, value in sent.items() if value is not None or name == "label_budget"}
     row.policy = LabelingPolicy.model_validate(row.policy | changes).model_dump(mode="json")
     events.record(session, row.id, "project.changed", dict(changes), now)
     return row
+
+
+def refuse_privileged(field: str, strategy: str) -> None:
+    """A strategy that needs hidden actions is for benchmarks only. Raises PrivilegedStrategy."""
+    if strategy in PRIVILEGED:
+        raise PrivilegedStrategy(field, strategy)
 
 
 def policy_of(row: ProjectRow) -> LabelingPolicy:

@@ -49,6 +49,12 @@ def register(
     return row
 
 
+def trained(row: ModelVersionRow) -> TrainedModel:
+    """What was registered, to be registered for another round as well."""
+    fields = (row.kind, row.member, row.family, dict(row.config), row.sha256, row.bytes)
+    return TrainedModel(*fields, metrics={name: float(str(value)) for name, value in row.metrics.items()})
+
+
 def find(session: Session, model_id: UUID) -> ModelVersionRow:
     """The model version's row. Raises UnknownResource."""
     row = session.get(ModelVersionRow, model_id)

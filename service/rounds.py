@@ -7,7 +7,7 @@ from uuid import UUID
 from sqlalchemy.orm import Session
 
 from api_schemas.jobs import TrainRound, TrainSubgoalGenerator
-from api_schemas.rounds import ModelError, ModelErrorCurve, ModelErrorPoint, Round, Stage
+from api_schemas.rounds import Diagnostics, ModelError, ModelErrorCurve, ModelErrorPoint, Round, Stage
 from service import events, jobs, projects
 from service.errors import NoModelFamily, NothingToLearn, UnknownResource
 from service.store.queries import jobs as job_queries
@@ -82,6 +82,15 @@ def record_error(session: Session, round_id: UUID, error: ModelError, now: datet
     row.model_error = error.model_dump(mode="json")
     data: dict[str, object] = {"round": str(row.id), "labels": row.labels, "loss": error.loss}
     events.record(session, row.project_id, "round.evaluated", data, now)
+
+
+def record_diagnostics(session: Session, round_id: UUID, diagnostics: Diagnostics, now: datetime) -> None:
+    """Store the round's diagnostics; what they warn of is an event."""
+    row = find(session, round_id, lock=True)
+    row.diagnostics = diagnostics.model_dump(mode="json")
+    if diagnostics.warnings:
+        data: dict[str, object] = {"round": str(row.id), "number": row.number, "warnings": diagnostics.warnings}
+        events.record(session, row.project_id, "round.warned", data, now)
 
 
 def begin_scoring(session: Session, round_id: UUID, now: datetime) -> None:
@@ -160,6 +169,7 @@ def describe(session: Session, row: RoundRow) -> Round:
         stages=[Stage.model_validate(stage) for stage in row.stages],
         models=models,
         model_error=None if row.model_error is None else ModelError.model_validate(row.model_error),
+        diagnostics=None if row.diagnostics is None else Diagnostics.model_validate(row.diagnostics),
         job=row.job_id,
         error=row.error,
         created_at=row.created_at,

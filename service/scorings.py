@@ -20,6 +20,7 @@ from service.store.queries import rows
 from service.store.tables import JobRow, ProjectRow, QueueRow, RoundRow, ScoringRow, ShardRow
 
 NEEDS: dict[str, frozenset[str]] = {strategy.name: frozenset(strategy.needs) for strategy in CATALOG}
+PREVIOUS = "previous_world_model"  # the one network that a round does not train: the round before has
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,7 @@ def _request(
 ) -> JobRow:
     """Score with the current round's networks, which are trained first where this strategy needs more of them."""
     have = {model.kind for model in round_queries.models_of(session, round_row.id)} if round_row else set()
-    if round_row is not None and not NEEDS[strategy] <= have:
+    if round_row is not None and not NEEDS[strategy] - {PREVIOUS} <= have:
         waiting = job_queries.unfinished(session, round_row.id)
         payload = TrainRound.model_validate({"round": round_row.id, "strategy": strategy})
         return waiting or jobs.enqueue(session, project.id, payload, round_row.id, now, limits.max_attempts)

@@ -48,6 +48,7 @@ def _group(figures: GroupFigures) -> GroupError:
     return GroupError(
         transitions=figures.transitions,
         loss=figures.next_state_loss,
+        exact_accuracy=figures.exact_accuracy,
         dynamics_accuracy=figures.dynamics_accuracy,
         inverse_accuracy=figures.inverse_accuracy,
     )

@@ -1,6 +1,5 @@
 """Scoring: shards of the pool are scored apart, merged once, and ordered into the queue that acquire gives from."""
 
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from uuid import UUID
@@ -14,9 +13,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from api_schemas.jobs import ScoreShard
-from models.acquisition import STRATEGIES
-from models.acquisition.base import Models, score_pool
-from models.acquisition.diversification import diversify, features
+from models.acquisition import BATCH_RULES, STRATEGIES, Models, describe, score_pool
+from models.chance import scoring_generator
 from service import projects, rounds, scorings
 from service.log import get_logger
 from service.scorings import Ranked
@@ -101,14 +99,27 @@ def _note_sizes(job: RunningJob) -> None:
         log.warning("sizes_not_noted", error=str(error))
 
 
-def load_models(database: Database, blobs: Blobs, project: ProjectRow, round_id: UUID | None) -> Models:
-    """The networks that a round has trained so far. Call it outside of any transaction: the store may take minutes."""
+def load_models(
+    database: Database, blobs: Blobs, project: ProjectRow, round_id: UUID | None, needs: frozenset[str]
+) -> Models:
+    """Of the networks that a round has trained so far those that are needed, the previous round's world model too.
+
+    Call it outside of any transaction: the store may take minutes.
+    """
     with database.read() as session:
-        rows = round_queries.models_of(session, round_id) if round_id else []
-    networks = [(row.kind, load_network(blobs, row, project)) for row in rows]
+        rows = [(row.kind, row) for row in (round_queries.models_of(session, round_id) if round_id else [])]
+        if round_id and scorings.PREVIOUS in needs:
+            previous = round_queries.previous_world_model(session, rounds.find(session, round_id))
+            rows += [] if previous is None else [(scorings.PREVIOUS, previous)]
+    networks = [(kind, load_network(blobs, row, project)) for kind, row in rows if kind in needs]
     single = {kind: network for kind, network in networks if kind != "ensemble"}
     ensemble = tuple(network for kind, network in networks if kind == "ensemble")
     return Models(**single, ensemble=ensemble)  # type: ignore[arg-type]  # kinds are the fields of Models
+
+
+def _load(job: RunningJob, project: ProjectRow, scoring: ScoringRow) -> Models:
+    needs = scorings.NEEDS[scoring.strategy]
+    return load_models(job.worker.database, job.worker.blobs, project, scoring.round_id, needs)
 
 
 def _scores(
@@ -118,7 +129,7 @@ def _scores(
     windows: Sequence[data.Windows],
     generator: torch.Generator,
 ) -> NDArray[np.float32]:
-    models = load_models(job.worker.database, job.worker.blobs, project, scoring.round_id)
+    models = _load(job, project, scoring)
     total = sum(len(window.starts) for window in windows)
     parts: list[torch.Tensor] = []
     for batch in data.chunks(job.worker.blobs, windows, project.segment_length, job.go_on):
@@ -136,24 +147,22 @@ def _order(
     candidates: NDArray[np.int64],
     members: dict[int, MembershipRow],
 ) -> NDArray[np.int64]:
-    """Places in `candidates`, best first: diversified where the policy says so and the strategy has models."""
-    if not scorings.NEEDS[scoring.strategy] or not projects.policy_of(project).diversify or not len(candidates):
+    """Places in `candidates`, best first, as the policy's batch rule has it where the strategy has models.
+
+    The order of a strategy that needs none is a draw already.
+    """
+    rule, strategy = BATCH_RULES[projects.policy_of(project).batch_rule], STRATEGIES[scoring.strategy]
+    if not strategy.needs or not len(candidates):
         return np.arange(len(candidates))
     with job.worker.database.read() as session:
         windows = _candidate_windows(session, project, pool, candidates, members)
         generator = _generator(session, project, scoring, f"selection {scoring.selections}")
-    models = load_models(job.worker.database, job.worker.blobs, project, scoring.round_id)
+    models = _load(job, project, scoring)
     batch = data.load_in_order(job.worker.blobs, windows, project.segment_length, job.go_on)
-    job.report(0.6, f"diversifying {len(candidates)} candidates")
-    described = features(_needed(models, scoring.strategy), batch)
-    scores = torch.from_numpy(pool.scores[candidates])
-    order: NDArray[np.int64] = diversify(scores, described, len(candidates), generator).numpy()
+    job.report(0.6, f"ordering {len(candidates)} candidates by {rule.name}")
+    described = describe(rule, strategy, models, batch, torch.from_numpy(pool.scores[candidates]))
+    order: NDArray[np.int64] = rule.order(described, len(candidates), generator).numpy()
     return order
-
-
-def _needed(models: Models, strategy: str) -> Models:
-    """Only the networks that the strategy reads: an arm is not diversified through another arm's networks."""
-    return Models(**{name: getattr(models, name) for name in STRATEGIES[strategy].needs})
 
 
 def _candidate_windows(
@@ -205,8 +214,6 @@ def _unpack(blobs: Blobs, shas: Sequence[str], after_each: Callable[[], None] = 
 
 
 def _generator(session: Session, project: ProjectRow, scoring: ScoringRow, what: str) -> torch.Generator:
-    """Projects of equal seed and pool draw alike, whatever their ids."""
     number = rounds.find(session, scoring.round_id).number if scoring.round_id else 0
     size = len(pool_queries.memberships(session, project.id, "pool", last=scoring.memberships))
-    text = f"{project.seed}/{scoring.strategy}/{number}/{size}/{what}"
-    return torch.Generator().manual_seed(zlib.crc32(text.encode()))
+    return scoring_generator(project.seed, scoring.strategy, number, size, what)

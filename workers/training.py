@@ -1,13 +1,12 @@
-"""Rounds: train, evaluate, ask for the scoring. Each stage is stored before the next; a stored one is not redone."""
+"""Rounds: train, evaluate, diagnose, ask for scoring. Each stage is stored before the next; no stored one is redone."""
 
 import time
-import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
-
-import torch
 
 from api_schemas.jobs import TrainRound, TrainSubgoalGenerator
 from models import checkpoints
+from models.chance import training_generator
 from models.families import Family, family_named
 from models.network import Network
 from models.segments import SegmentBatch
@@ -20,13 +19,17 @@ from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
 from service.store.tables import ProjectRow, RoundRow
 from workers import data
+from workers.diagnosis import diagnose_round
 from workers.evaluation import model_error
 from workers.job import RunningJob
 from workers.stage import Stage
 
 ENSEMBLE_MEMBERS = 3
 BASE = frozenset({"inverse_dynamics", "world_model"})  # every round has these; model error is theirs
-ORDER = ("inverse_dynamics", "dense_inverse_dynamics", "world_model", "ensemble")
+ORDER = (
+    *("inverse_dynamics", "dense_inverse_dynamics", "masked_inverse_dynamics"),
+    *("world_model", "ensemble", "subgoal_generator"),
+)
 SUBGOAL_SEGMENTS = 50_000  # a larger pool is thinned out evenly
 
 
@@ -56,8 +59,12 @@ def run_round(job: RunningJob, payload: TrainRound) -> dict[str, object]:
     if labeled is None:
         raise NothingToLearn(plan.project.id)
     for number, (kind, member) in enumerate(plan.stages):
-        _train_stage(job, plan, kind, member, labeled, number)
+        if kind == "subgoal_generator":
+            _subgoal_stage(job, plan)
+        else:
+            _train_stage(job, plan, kind, member, labeled, number)
     _evaluate_stage(job, plan)
+    diagnose_round(job, plan.project, plan.round, labeled)
     return _request_scoring(job, plan)
 
 
@@ -74,23 +81,50 @@ def run_subgoal_generator(job: RunningJob, payload: TrainSubgoalGenerator) -> di
         if trained is not None and trained.watermark >= len(members):  # an attempt ended before its job was done
             return {"model": str(trained.id)}
         windows = data.windows_of(session, project, members, None)
+    stage = Stage(job, "subgoal_generator", None)
+    model = _trained_subgoal_generator(job, project, windows, stage)
+    with stage.finished() as session:
+        row = registry.register(session, project.id, None, model, len(members), job.now())
+    return {"model": str(row.id), "trajectories": len(members)}
+
+
+def _trained_subgoal_generator(
+    job: RunningJob, project: ProjectRow, windows: Sequence[data.Windows], stage: Stage
+) -> TrainedModel:
     every = max(1, sum(len(window.starts) for window in windows) // SUBGOAL_SEGMENTS)
     thinned = [data.Windows(w.trajectory, w.blob_sha256, w.starts[::every]) for w in windows if w.starts]
     batch = data.load(job.worker.blobs, thinned, project.segment_length, job.go_on)
     family = _family(project)
-    generator = _generator(project, 0, "subgoal_generator", 0)
+    generator = training_generator(project.seed, 0, "subgoal_generator")
     network = family.build_subgoal_generator(data.model_spaces(projects.spaces_of(project)), None, generator)
     config = family.training_config("subgoal_generator", batch.size)
 
     def tell(step: int, steps: int, loss: float) -> None:
         job.report(step / steps, f"subgoal generator, step {step} of {steps}, loss {loss:.3f}")
 
-    stage = Stage(job, "subgoal_generator", None)
     state = stage.train(network, batch, config, generator, tell)
-    model = _trained(job, "subgoal_generator", 0, network, state)
+    return _trained(job, "subgoal_generator", 0, network, state)
+
+
+def _subgoal_stage(job: RunningJob, plan: Plan) -> None:
+    """The round's subgoal generator: the project's newest, noted as the round's own so that its scores keep to it.
+
+    Where there is none yet it is trained here, on the pool as it is.
+    """
+    started = time.monotonic()
+    with job.worker.database.read() as session:
+        if registry.of_round(session, plan.round.id, "subgoal_generator"):
+            return
+        newest = round_queries.newest_model(session, plan.project.id, "subgoal_generator")
+        members = [] if newest else pool_queries.memberships(session, plan.project.id, "pool")
+        windows = data.windows_of(session, plan.project, members, None)
+    stage = Stage(job, "subgoal_generator", plan.round.id)
+    model = registry.trained(newest) if newest else _trained_subgoal_generator(job, plan.project, windows, stage)
+    watermark = newest.watermark if newest else len(members)
     with stage.finished() as session:
-        row = registry.register(session, project.id, None, model, len(members), job.now())
-    return {"model": str(row.id), "segments": batch.size}
+        registry.register(session, plan.project.id, plan.round.id, model, watermark, job.now())
+        jobs.made_progress(session, job.lease)
+        rounds.stage_done(session, plan.round.id, "subgoal_generator", time.monotonic() - started)
 
 
 def _plan(job: RunningJob, payload: TrainRound) -> Plan:
@@ -120,7 +154,7 @@ def _train_stage(job: RunningJob, plan: Plan, kind: str, member: int, labeled: S
             return
     started = time.monotonic()
     network_kind = "world_model" if kind == "ensemble" else kind
-    generator = _generator(plan.project, plan.round.number, kind, member)
+    generator = training_generator(plan.project.seed, plan.round.number, kind, member)
     spaces = data.model_spaces(projects.spaces_of(plan.project))
     network = plan.family.build(network_kind, spaces, {}, generator)
 
@@ -170,12 +204,6 @@ def _request_scoring(job: RunningJob, plan: Plan) -> dict[str, object]:
             scorings.start(session, project, plan.strategy, round_row, job.now(), limits)
         models = round_queries.models_of(session, plan.round.id)
     return {"round": str(plan.round.id), "models": len(models)}
-
-
-def _generator(project: ProjectRow, round_number: int, kind: str, member: int) -> torch.Generator:
-    """All chance of a stage. Projects of equal seed draw alike, so their arms differ in their labels only."""
-    text = f"{project.seed}/{round_number}/{kind}/{member}"
-    return torch.Generator().manual_seed(zlib.crc32(text.encode()))
 
 
 def _trained(job: RunningJob, kind: str, member: int, network: Network, state: TrainingState) -> TrainedModel:

@@ -14,7 +14,7 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 Url = Annotated[str, typer.Option("--url", envvar="ASIM_URL", help="Where the service listens.")]
 Key = Annotated[str | None, typer.Option("--key", envvar="ASIM_KEY", help="API key; embedded mode needs none.")]
 ProjectName = Annotated[str, typer.Argument(metavar="PROJECT", help="Name or id of the project.")]
-Strategy = Annotated[str | None, typer.Option(help="random, cycle, vanilla_cycle or uncertainty.")]
+Strategy = Annotated[str | None, typer.Option(help="How segments are scored; GET /strategies lists them.")]
 Mode = Annotated[
     Literal["pool", "explore"],
     typer.Option(help="Segments of the pool to label, or states to explore from and the actions to execute there."),

@@ -9,6 +9,8 @@ from asim.commands.console import DEFAULT_URL, Count, Json, Key, Mode, ProjectNa
 from asim.errors import AsimError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from api_schemas.acquisitions import Acquisition
     from api_schemas.projects import Project
 
@@ -101,15 +103,21 @@ def start_round(project: ProjectName, url: Url = DEFAULT_URL, key: Key = None) -
     """Retrain on all labels that are there now; wait until the round is current."""
     from asim.report import Report
     from asim.rounds import await_round
-    from asim.tables import error_table, show
+    from asim.tables import error_table, show, warning_lines
 
     with connect(url, key) as client, Report() as report:
         found = client.find_project(project)
         started = client.start_round(found.id)
         with report.step(f"round {started.number} of {found.name} on {started.labels} labels") as advance:
-            await_round(client, started.id, advance)
+            done = await_round(client, started.id, advance)
         curve = client.model_error(found.id)
     show(error_table({found.name: curve}))
+    _warn(warning_lines(found.name, done))
+
+
+def _warn(lines: "Iterable[str]") -> None:
+    for line in lines:
+        typer.echo(f"warning: {line}", err=True)
 
 
 def model_error(
@@ -119,12 +127,13 @@ def model_error(
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:
-    """The learning curves of projects: model error on held-out data after each round."""
-    from asim.tables import error_table, show
+    """The learning curves of projects: model error on held-out data after each round; what the current one warns of."""
+    from asim.tables import error_table, show, warning_lines
 
     with connect(url, key) as client:
         found = [client.find_project(name) for name in projects]
         curves = {project.name: client.model_error(project.id) for project in found}
+        current = {project.name: client.round(project.current_round) for project in found if project.current_round}
     if as_json:
         for curve in curves.values():
             typer.echo(curve.model_dump_json())
@@ -132,6 +141,7 @@ def model_error(
         show(error_table(curves))
     if any(point.model_error.loss is None for curve in curves.values() for point in curve.points):
         typer.echo("-: there were no held-out labels; collect or import some with --split held_out", err=True)
+    _warn(line for name, shown in current.items() for line in warning_lines(name, shown))
     if plot is not None:
         from asim.figure import draw_learning_curves
 

@@ -76,7 +76,7 @@ def change(
     project: ProjectName,
     *,
     strategy: Strategy = None,
-    diversify: Annotated[bool | None, typer.Option(help="Rank so that every prefix is a diverse batch.")] = None,
+    batch_rule: Annotated[str | None, typer.Option(help="How scored segments become a batch, top or another.")] = None,
     round_labels: RoundLabels = None,
     label_budget: LabelBudget = None,
     lease_seconds: Annotated[float | None, typer.Option(help="Of a batch, unless it is asked otherwise.")] = None,
@@ -88,7 +88,7 @@ def change(
 
     given = {
         "strategy": strategy,
-        "diversify": diversify,
+        "batch_rule": batch_rule,
         "round_labels": round_labels,
         "label_budget": label_budget,
         "lease_seconds": lease_seconds,

@@ -118,7 +118,9 @@ def _loaded(worker: Worker, project_id: UUID) -> tuple[Models, SegmentBatch]:
         current = round_queries.current_round(session, project_id)
         members = pool_queries.memberships(session, project_id, "pool")
         windows = data.windows_of(session, project, members, None)
-    models = load_models(worker.database, worker.blobs, project, current.id if current else None)
+    models = load_models(
+        worker.database, worker.blobs, project, current.id if current else None, scorings.NEEDS["cycle"]
+    )
     return models, data.load(worker.blobs, windows, project.segment_length)
 
 

@@ -1,24 +1,48 @@
 """Strategies: which segments to have labeled next. STRATEGIES is the only registry."""
 
 from models.acquisition.base import Models, NonFiniteScoreError, Strategy, score_pool
+from models.acquisition.batch_rules import BATCH_RULES, BatchRule, Candidates, describe, top
 from models.acquisition.cycle import Cycle
-from models.acquisition.diversification import CANDIDATES_PER_PICK, diversify, features, top
+from models.acquisition.fidelity import Fidelity
+from models.acquisition.forward_cycle import ForwardCycle
+from models.acquisition.masked_cycle import MaskedCycle
+from models.acquisition.oracle import Oracle
+from models.acquisition.oracle_easy import OracleEasy
+from models.acquisition.oracle_uniform import OracleUniform
+from models.acquisition.progress import Progress, TrueProgress
 from models.acquisition.random import Random
+from models.acquisition.reachability import Reachability
+from models.acquisition.self_inverse import SelfInverse
 from models.acquisition.uncertainty import Uncertainty
 from models.acquisition.vanilla_cycle import VanillaCycle
 
 __all__ = [
-    "CANDIDATES_PER_PICK",
+    "BATCH_RULES",
     "STRATEGIES",
+    "BatchRule",
+    "Candidates",
     "Models",
     "NonFiniteScoreError",
     "Strategy",
-    "diversify",
-    "features",
+    "describe",
     "score_pool",
     "top",
 ]
 
-STRATEGIES: dict[str, Strategy] = {
-    strategy.name: strategy for strategy in (Random(), Cycle(), VanillaCycle(), Uncertainty())
-}
+_ALL: tuple[Strategy, ...] = (
+    Random(),
+    Cycle(),
+    MaskedCycle(),
+    VanillaCycle(),
+    SelfInverse(),
+    Uncertainty(),
+    Progress(),
+    Fidelity(),
+    Reachability(),
+    ForwardCycle(),
+    TrueProgress(),
+    Oracle(),
+    OracleEasy(),
+    OracleUniform(),
+)
+STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in _ALL}

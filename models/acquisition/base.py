@@ -2,16 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from models.inverse_dynamics.base import InverseDynamics
+from models.inverse_dynamics.base import DiscreteInverseDynamics
 from models.segments import SegmentBatch
+from models.subgoal_generators.base import SubgoalGenerator
 from models.world_models.base import WorldModel
 
 CHUNK = 128  # segments a forward pass; larger ones leave the processor's cache
+FIRST_ROUND_LACKS = frozenset({"previous_world_model"})
+"""Networks that a strategy may need and a project's first round cannot have; the strategy says what it does then."""
+
+Part = TypeVar("Part")
 
 
 class NonFiniteScoreError(ValueError):
@@ -20,16 +25,19 @@ class NonFiniteScoreError(ValueError):
 
 @dataclass(frozen=True)
 class Models:
-    """The trained networks of a round, as far as it trained them."""
+    """The trained networks of a round, as far as it trained them, and the world model of the round before."""
 
     world_model: WorldModel | None = None
-    inverse_dynamics: InverseDynamics | None = None
-    dense_inverse_dynamics: InverseDynamics | None = None
+    inverse_dynamics: DiscreteInverseDynamics | None = None
+    dense_inverse_dynamics: DiscreteInverseDynamics | None = None
+    masked_inverse_dynamics: DiscreteInverseDynamics | None = None
+    subgoal_generator: SubgoalGenerator | None = None
+    previous_world_model: WorldModel | None = None
     ensemble: tuple[WorldModel, ...] = ()
 
 
 class Strategy(Protocol):
-    """Scores segments; a higher score is a segment more worth labeling. Ranking is a step of its own.
+    """Scores segments; a higher score is a segment more worth labeling. Ranking is a step of its own: a batch rule.
 
     privileged: needs hidden actions (benchmarks only). needs: names of the fields of Models it reads.
     """
@@ -43,8 +51,24 @@ class Strategy(Protocol):
     @property
     def needs(self) -> frozenset[str]: ...
 
+    def actions(self, models: Models, batch: SegmentBatch) -> Tensor | None:
+        """The actions (B, L) under which it looks at segments, for batch rules to compare them; None where it has none.
+
+        So no arm's batch is diversified through another arm's networks.
+        """
+        ...
+
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """Scores (B,) of segments on the models' device, finite. Every draw comes from the generator."""
+        ...
+
+
+@runtime_checkable
+class PoolStrategy(Protocol):
+    """A strategy whose scores depend on those of the whole pool."""
+
+    def over_pool(self, scores: Tensor, generator: torch.Generator) -> Tensor:
+        """The scores (N,) of all segments together, from what `score` gave each."""
         ...
 
 
@@ -68,14 +92,28 @@ def score_pool(
         after_each()
     scores = torch.cat(parts).cpu() if parts else torch.zeros(0)
     _require_finite(strategy, scores, batch)
-    return scores
+    return strategy.over_pool(scores, generator) if isinstance(strategy, PoolStrategy) else scores
 
 
 def require(strategy: Strategy, models: Models) -> None:
     """Raises ValueError naming the models that the strategy needs and `models` does not hold."""
-    missing = sorted(name for name in strategy.needs if not getattr(models, name))
+    missing = sorted(name for name in strategy.needs - FIRST_ROUND_LACKS if not getattr(models, name))
     if missing:
         raise ValueError(f"Strategy {strategy.name} needs {', '.join(missing)}, which this round has not trained.")
+
+
+def given(strategy: Strategy, name: str, part: Part | None) -> Part:
+    """The part of the models that a strategy reads. Raises ValueError where it is missing."""
+    if part is None:
+        raise ValueError(f"Strategy {strategy.name} needs {name}, which this round has not trained.")
+    return part
+
+
+def labels(strategy: Strategy, batch: SegmentBatch) -> Tensor:
+    """The hidden actions (B, L) that a privileged strategy looks at. Raises ValueError for an unlabeled batch."""
+    if batch.actions is None:
+        raise ValueError(f"Strategy {strategy.name} is privileged: it needs the actions, which these segments lack.")
+    return batch.actions
 
 
 def _require_finite(strategy: Strategy, scores: Tensor, batch: SegmentBatch) -> None:

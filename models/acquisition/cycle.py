@@ -5,21 +5,38 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.acquisition.base import Models
+from models.acquisition.base import Models, given
 from models.cycle_consistency import cycle_error
+from models.inverse_dynamics.base import DiscreteInverseDynamics
 from models.segments import SegmentBatch
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """L_cyc of a segment with its own observed future as the chain."""
+    """L_cyc of a segment with its own observed future as the chain.
+
+    inverse: the field of Models whose inverse dynamics infers; the sparse one, its learned mask and the dense one make
+    three arms.
+    """
 
     name: str = "cycle"
+    inverse: str = "inverse_dynamics"
     privileged: bool = False
-    needs: frozenset[str] = frozenset({"world_model", "inverse_dynamics"})
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """The world model and the inverse dynamics."""
+        return frozenset({"world_model", self.inverse})
+
+    def actions(self, models: Models, batch: SegmentBatch) -> Tensor:
+        """The inferred ones."""
+        return self._verifier(models).infer(batch.observations)
 
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """(B,) in the world model's distance. Draws nothing from the generator."""
-        if models.world_model is None or models.inverse_dynamics is None:
-            raise ValueError("Strategy cycle needs a world_model and inverse_dynamics.")
-        return cycle_error(models.world_model, models.inverse_dynamics, batch.observations)
+        world_model = given(self, "world_model", models.world_model)
+        return cycle_error(world_model, self._verifier(models), batch.observations)
+
+    def _verifier(self, models: Models) -> DiscreteInverseDynamics:
+        verifier: DiscreteInverseDynamics | None = getattr(models, self.inverse)
+        return given(self, self.inverse, verifier)

@@ -17,6 +17,9 @@ class Random:
     privileged: bool = False
     needs: frozenset[str] = frozenset()
 
+    def actions(self, models: Models, batch: SegmentBatch) -> None:
+        """None: it looks at nothing, so every batch rule leaves its order alone."""
+
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """(B,), on the generator's device."""
         return torch.rand(batch.size, generator=generator, device=generator.device)

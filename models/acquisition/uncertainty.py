@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.acquisition.base import Models
+from models.acquisition.base import Models, given
 from models.segments import Observations, SegmentBatch, first
 from models.world_models.base import WorldModel
 
@@ -18,12 +18,16 @@ class Uncertainty:
     privileged: bool = False
     needs: frozenset[str] = frozenset({"inverse_dynamics", "ensemble"})
 
+    def actions(self, models: Models, batch: SegmentBatch) -> Tensor:
+        """The inferred ones."""
+        return given(self, "inverse_dynamics", models.inverse_dynamics).infer(batch.observations)
+
     @torch.inference_mode()
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """(B,): mutual information of member and prediction (grid), summed over steps. Draws nothing."""
-        if models.inverse_dynamics is None or len(models.ensemble) < 2:
-            raise ValueError(f"Strategy uncertainty needs inverse_dynamics and 2 members, got {len(models.ensemble)}.")
-        actions = models.inverse_dynamics.infer(batch.observations)
+        if len(models.ensemble) < 2:
+            raise ValueError(f"Strategy uncertainty needs an ensemble of at least 2, got {len(models.ensemble)}.")
+        actions = self.actions(models, batch)
         decoded = [_decoded(member, batch.observations, actions) for member in models.ensemble]
         return models.ensemble[0].disagreement(decoded).view(batch.size, batch.length).sum(1)
 

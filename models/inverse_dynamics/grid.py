@@ -4,21 +4,33 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from models.inverse_dynamics.base import negative_log_likelihood
+from models.inverse_dynamics.elements import (
+    ElementPairs,
+    action_count,
+    element_count,
+    element_words,
+    one_hot,
+    pairs,
+    steps,
+    touched_elements,
+)
 from models.networks import grid as cells
-from models.networks.initialisation import initialise, table
-from models.networks.mlp import Mlp
+from models.networks.initialisation import initialise
+from models.networks.symmetry import every_turn, turned
 from models.segments import Observations, SegmentBatch
-from models.spaces import DiscreteAction, Spaces
+from models.spaces import Spaces
+
+TOUCHED = 3  # the agent's cell, the one in front, the hand
 
 
 @dataclass(frozen=True)
 class SparseInverseDynamicsConfig:
-    """Widths of the two hidden layers."""
+    """Widths of the two hidden layers; share of an element's channels hidden in training."""
 
     hidden: int = 64
+    dropout: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -30,10 +42,7 @@ class DenseInverseDynamicsConfig:
 
 
 class GridSparseInverseDynamics(nn.Module):
-    """Reads M*x_t and M*x_{t+1}: the agent's cell and the cell in front of it, both fixed by x_t, and the hand.
-
-    Six elements (two cells and the hand, at both times), each one-hot in object, colour and state.
-    """
+    """Reads M*x_t and M*x_{t+1}: the agent's cell and the cell in front of it, both fixed by x_t, and the hand."""
 
     family = "grid"
     kind = "inverse_dynamics"
@@ -41,10 +50,13 @@ class GridSparseInverseDynamics(nn.Module):
     def __init__(self, spaces: Spaces, config: SparseInverseDynamicsConfig, generator: torch.Generator) -> None:
         super().__init__()
         self.spaces, self.config = spaces, config
-        # A linear layer over one-hot inputs is a sum of rows: (6 elements * 22 words, hidden).
-        self.rows = table(6 * cells.WORDS, config.hidden, 0.3)
-        self.mlp = Mlp((config.hidden, config.hidden, _actions(spaces)))
+        self.head = ElementPairs(TOUCHED, config.hidden, action_count(spaces), config.dropout)
         initialise(self, generator)
+
+    @property
+    def coordinates(self) -> int:
+        """Elements of an observation: cells and the hand."""
+        return element_count(self.spaces)
 
     def check(self, batch: SegmentBatch) -> None:
         """Raises ValueError for values outside the vocabulary."""
@@ -59,26 +71,37 @@ class GridSparseInverseDynamics(nn.Module):
         return self._log_prob(observations).argmax(-1)
 
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
-        """Mean negative log-likelihood of the labels. Draws nothing from the generator."""
-        return negative_log_likelihood(self.log_prob(batch), batch).mean()
+        """Mean negative log-likelihood of the labels; the generator turns the rooms and hides channels."""
+        batch = turned(batch, generator)
+        return negative_log_likelihood(self._log_prob(batch.observations, generator), batch).mean()
 
-    def _log_prob(self, observations: Observations) -> Tensor:
-        before, after = _pairs(observations)
-        touched = cells.touched_cells(before["grid"])  # (B*L, 2)
-        elements = torch.cat(
-            [
-                part
-                for frame in (before, after)
-                for part in (cells.gather_cells(frame["grid"].flatten(1, 2), touched), frame["carried"].unsqueeze(1))
-            ],
-            1,
-        )  # (B*L, 6, 3)
-        offsets = torch.arange(6, device=elements.device).unsqueeze(1) * cells.WORDS
-        channels = torch.tensor((0, cells.OBJECTS, cells.OBJECTS + cells.COLOURS), device=elements.device)
-        words = (elements.long() + offsets + channels).flatten(1)  # (B*L, 18)
-        hidden = F.embedding_bag(words, self.rows, mode="sum")
-        logits: Tensor = self.mlp(hidden.relu())
-        return logits.log_softmax(-1).view(-1, _steps(observations), logits.shape[-1])
+    def kept(self, observations: Observations) -> Tensor:
+        """Elements of each first frame that are read: int64 (B,)."""
+        grid = observations["grid"]
+        return torch.full((len(grid),), TOUCHED, device=grid.device)
+
+    def views(self, batch: SegmentBatch) -> SegmentBatch:
+        """The rooms in all four turns."""
+        return every_turn(batch)
+
+    def verifying_block(self, observations: Observations) -> Tensor:
+        """z_S: the channels of the six elements, each one-hot: uint8 (B*L, 6*22)."""
+        return torch.cat([one_hot(elements) for elements in touched_elements(*pairs(observations))], 1).flatten(1)
+
+    def rest(self, observations: Observations) -> Tensor:
+        """All cells of both frames, one-hot but for the touched ones, which are zero: uint8 (B*L, 2*S*S*22).
+
+        A cell that only one of two steps touches counts half as much as one that differs.
+        """
+        before, after = pairs(observations)
+        touched = cells.touched_cells(before["grid"]).unsqueeze(2).expand(-1, -1, cells.WORDS)
+        frames = [one_hot(frame["grid"].flatten(1, 2)).scatter_(1, touched, 0) for frame in (before, after)]
+        return torch.cat(frames, 1).flatten(1)
+
+    def _log_prob(self, observations: Observations, generator: torch.Generator | None = None) -> Tensor:
+        words = element_words(*touched_elements(*pairs(observations)))
+        logits: Tensor = self.head(words, generator)
+        return logits.log_softmax(-1).view(-1, steps(observations), logits.shape[-1])
 
 
 class GridDenseInverseDynamics(nn.Module):
@@ -92,8 +115,13 @@ class GridDenseInverseDynamics(nn.Module):
         self.spaces, self.config = spaces, config
         size = spaces.observations["grid"].shape[0]
         self.encoder = cells.GridEncoder(size, config.channels, frames=2)
-        self.head = cells.PooledHead(size, config.channels, config.hidden, _actions(spaces))
+        self.head = cells.PooledHead(size, config.channels, config.hidden, action_count(spaces))
         initialise(self, generator)
+
+    @property
+    def coordinates(self) -> int:
+        """Elements of an observation: cells and the hand."""
+        return element_count(self.spaces)
 
     def check(self, batch: SegmentBatch) -> None:
         """Raises ValueError for values outside the vocabulary."""
@@ -108,25 +136,30 @@ class GridDenseInverseDynamics(nn.Module):
         return self._log_prob(observations).argmax(-1)
 
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
-        """Mean negative log-likelihood of the labels. Draws nothing from the generator."""
-        return negative_log_likelihood(self.log_prob(batch), batch).mean()
+        """Mean negative log-likelihood of the labels; the generator turns the rooms."""
+        return negative_log_likelihood(self.log_prob(turned(batch, generator)), batch).mean()
+
+    def kept(self, observations: Observations) -> Tensor:
+        """All elements: int64 (B,)."""
+        grid = observations["grid"]
+        return torch.full((len(grid),), self.coordinates, device=grid.device)
+
+    def views(self, batch: SegmentBatch) -> SegmentBatch:
+        """The rooms in all four turns."""
+        return every_turn(batch)
+
+    def verifying_block(self, observations: Observations) -> Tensor:
+        """It reads everything: all cells and the hand of both frames, one-hot: uint8 (B*L, 2*(S*S+1)*22)."""
+        frames = [
+            one_hot(torch.cat((frame["grid"].flatten(1, 2), frame["carried"].unsqueeze(1)), 1))
+            for frame in pairs(observations)
+        ]
+        return torch.cat(frames, 1).flatten(1)
+
+    def rest(self, observations: Observations) -> Tensor:
+        """Nothing: (B*L, 0)."""
+        return observations["grid"].new_zeros(len(observations["grid"]) * steps(observations), 0)
 
     def _log_prob(self, observations: Observations) -> Tensor:
-        logits: Tensor = self.head(self.encoder(_pairs(observations)))
-        return logits.log_softmax(-1).view(-1, _steps(observations), logits.shape[-1])
-
-
-def _actions(spaces: Spaces) -> int:
-    if not isinstance(spaces.action, DiscreteAction):
-        raise TypeError(f"Grid inverse dynamics needs a discrete action space, got {spaces.action}.")
-    return spaces.action.n
-
-
-def _steps(observations: Observations) -> int:
-    return int(observations["grid"].shape[1]) - 1
-
-
-def _pairs(observations: Observations) -> tuple[Observations, Observations]:
-    """(B, L+1, ...) -> x_t and x_{t+1}, each (B*L, ...)."""
-    before = {name: stream[:, :-1].flatten(0, 1) for name, stream in observations.items()}
-    return before, {name: stream[:, 1:].flatten(0, 1) for name, stream in observations.items()}
+        logits: Tensor = self.head(self.encoder(pairs(observations)))
+        return logits.log_softmax(-1).view(-1, steps(observations), logits.shape[-1])

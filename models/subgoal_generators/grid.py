@@ -9,6 +9,7 @@ from torch.nn import functional as F
 from models.networks import grid as cells
 from models.networks.film import FilmDynamics
 from models.networks.initialisation import gumbel, initialise, table
+from models.networks.symmetry import turned
 from models.segments import Observations, SegmentBatch, at
 from models.spaces import Spaces
 
@@ -58,7 +59,7 @@ class GridSubgoalGenerator(nn.Module):
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """Mean over transitions of -log p(x'|x, k) - log p(k|x) at each pair's best k."""
         _refuse_actions(batch)
-        pairs = batch.transitions().observations
+        pairs = turned(batch.transitions(), generator).observations
         before, after = at(pairs, 0), at(pairs, 1)
         state: Tensor = self.encoder((before,))
         prior = self.prior(state).log_softmax(1)  # (B, K)

@@ -28,6 +28,10 @@ class WorldModel(Network, Protocol):
         """States (B, ...) -> parameters of the distribution over observations, in the family's layout."""
         ...
 
+    def observe(self, state: Tensor) -> Observations:
+        """The likeliest observation of each state: (B, ...) -> (B, ...), in the dtype of the space."""
+        ...
+
     def infer_state(
         self, observations: Observations, actions: Tensor | None = None, context: Tensor | None = None
     ) -> Tensor:
@@ -51,6 +55,10 @@ class WorldModel(Network, Protocol):
 
     def latent_features(self, observations: Observations, actions: Tensor) -> Tensor:
         """The predicted latent where the action acts: (B, L+1, ...), (B, L, ...) -> (B, D), for diversity."""
+        ...
+
+    def signatures(self, observations: Observations, actions: Tensor) -> Tensor:
+        """What happens in each segment, without where: (B, L+1, ...), (B, L, ...) -> int64 (B, S), equal for equals."""
         ...
 
     def changes(self, prediction: Tensor, observations: Observations) -> tuple[Tensor, Tensor]:

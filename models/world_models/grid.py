@@ -10,6 +10,7 @@ from models.networks import grid as cells
 from models.networks.film import FilmDynamics
 from models.networks.initialisation import initialise
 from models.networks.quantisation import SupervisedCodebook
+from models.networks.symmetry import turned
 from models.segments import Observations, SegmentBatch, at, flatten_steps, future
 from models.spaces import DiscreteAction, Spaces
 
@@ -64,6 +65,10 @@ class GridWorldModel(nn.Module):
         logits: Observations = self.decoder(state)
         return logits
 
+    def observe(self, state: Tensor) -> Observations:
+        """(B, S, S, C) -> the mode of every channel: uint8 grid (B, S, S, 3), carried (B, 3)."""
+        return cells.decoded_modes(self.decode(state), self.size)
+
     def infer_state(
         self, observations: Observations, actions: Tensor | None = None, context: Tensor | None = None
     ) -> Tensor:
@@ -85,9 +90,14 @@ class GridWorldModel(nn.Module):
         return cells.observation_cross_entropy(logits, flatten_steps(reference)).view(batch, steps).sum(1)
 
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
-        """Mean nats a transition + reconstruction of x_t + the codebook's loss. Draws nothing from the generator."""
+        """Mean nats a transition + reconstruction of x_t + the codebook's loss.
+
+        The generator turns the rooms and, where several actions explain a step, draws one.
+        """
         if batch.actions is None:
             raise ValueError("The grid world model trains on labeled segments; the batch carries no actions.")
+        batch = turned(batch.with_drawn_actions(generator), generator)
+        assert batch.actions is not None  # noqa: S101  # drawn or given
         now = at(batch.observations, 0)
         state = self.encode(now)
         prediction = self.rollout(state, batch.actions)
@@ -109,9 +119,19 @@ class GridWorldModel(nn.Module):
         touched = cells.touched_cells(observations["grid"][:, :-1].flatten(0, 1))  # (B*L, 2)
         return cells.gather_cells(prediction, touched).view(batch, steps, -1).mean(1)
 
+    def signatures(self, observations: Observations, actions: Tensor) -> Tensor:
+        """Per step the action, the cell in front and the hand before, and both after it -> int64 (B, 5 * L)."""
+        grid = observations["grid"]
+        front = cells.touched_cells(grid[:, :-1].flatten(0, 1))[:, 1:]  # (B*L, 1)
+        parts = [actions.reshape(-1)]
+        for frame in (slice(None, -1), slice(1, None)):
+            seen = cells.gather_cells(grid[:, frame].flatten(0, 1).flatten(1, 2), front).squeeze(1)  # (B*L, 3)
+            parts += [cells.word(seen), cells.word(observations["carried"][:, frame].flatten(0, 1))]
+        return torch.stack(parts, 1).view(len(actions), -1)  # (B*L, 5) -> (B, 5*L)
+
     def changes(self, prediction: Tensor, observations: Observations) -> tuple[Tensor, Tensor]:
         """A cell is right when its three channels are; the carried object counts as one element more."""
-        guess = cells.decoded_modes(self.decode(prediction), self.size)
+        guess = self.observe(prediction)
         correct = torch.zeros(len(prediction), dtype=torch.int64, device=prediction.device)
         changed = torch.zeros_like(correct)
         for name, stream in observations.items():

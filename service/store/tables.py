@@ -196,7 +196,7 @@ class QueueRow(Row):
 
 
 class RoundRow(Row):
-    """One retraining on all labels up to `watermark`. `stages` and `model_error` are written as they are done."""
+    """One retraining on all labels up to `watermark`. Stages and what they find are written as they are done."""
 
     __tablename__ = "round"
     id: Mapped[UUID] = mapped_column(primary_key=True, default=uuid4)
@@ -207,6 +207,7 @@ class RoundRow(Row):
     status: Mapped[str] = mapped_column(String(12))
     stages: Mapped[list[object]]
     model_error: Mapped[dict[str, object] | None]
+    diagnostics: Mapped[dict[str, object] | None]
     job_id: Mapped[UUID | None]
     error: Mapped[str | None]
     created_at: Mapped[datetime]

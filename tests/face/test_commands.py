@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 
 from api_schemas.collections import CollectionCreate
+from api_schemas.rounds import Round
 from asim.cli import main
 from asim.client import Client
+from service.store.database import open_database
+from service.store.tables import RoundRow
 
 
 class Asim(Protocol):
@@ -197,3 +200,29 @@ def test_the_error_of_a_project_without_rounds_is_an_empty_table(asim: Asim, own
     assert "test loss" in asim("error", own, "--plot", str(picture))
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert json.loads(asim("error", own, "--json"))["points"] == []
+
+
+def test_what_a_rounds_diagnostics_warn_of_is_said_below_its_error(
+    asim: Asim, own: str, served_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = open_database(f"sqlite:///{served_folder / 'asim.db'}")
+    parts = dict.fromkeys(("mask", "support", "aliasing", "back_action", "back_action_in_support", "ranking"))
+
+    def at_once(client: Client, round_id: UUID, _: object) -> Round:
+        """In the place of training: the round as it may end."""
+        job = client.round(round_id).job
+        assert job is not None
+        client.cancel_job(job)
+        with database.write() as session:
+            row = session.get_one(RoundRow, round_id)
+            row.diagnostics = {**parts, "sampled": 9, "actions": [], "warnings": ["The score does not rank."]}
+            row.status = "current"
+        return client.round(round_id)
+
+    monkeypatch.setattr("asim.rounds.await_round", at_once)
+    asim("import", own, str(recording(tmp_path / "labeled.npz", 4, labeled=True)), "--split", "pool")
+    sentence = f"warning: {own}, round 1: The score does not rank.\n"
+    assert asim("round", own, stderr=True).endswith(sentence)
+    assert asim("error", own, stderr=True).endswith(sentence)
+    assert sentence not in asim("error", own, "--json")
+    database.close()

@@ -7,9 +7,9 @@ from uuid import uuid4
 
 from rich.console import Console
 
-from api_schemas.rounds import GroupError, ModelError, ModelErrorCurve, ModelErrorPoint
+from api_schemas.rounds import GroupError, ModelError, ModelErrorCurve, ModelErrorPoint, Round
 from asim.figure import draw_learning_curves
-from asim.tables import error_table
+from asim.tables import error_table, warning_lines
 
 
 def curve(losses: dict[int, float | None]) -> ModelErrorCurve:
@@ -61,3 +61,23 @@ def test_the_table_shows_each_round_and_marks_unknown_numbers() -> None:
         ["cycle", "200", "0.5000", "50.0%", "90.0%", "-"],
         ["cycle", "300", "0.2500", "75.0%", "90.0%", "-"],
     ]
+
+
+def warned(*warnings: str) -> Round:
+    """A second round whose diagnostics say only this."""
+    parts = dict.fromkeys(("mask", "support", "aliasing", "back_action", "back_action_in_support", "ranking"))
+    fields = dict.fromkeys(("model_error", "job", "error", "finished_at"))
+    ids = {"id": uuid4(), "project": uuid4(), "number": 2, "watermark": 9, "labels": 9, "stages": [], "models": {}}
+    diagnostics = {**parts, "sampled": 0, "actions": [], "warnings": list(warnings)}
+    moment = {"status": "current", "created_at": datetime(2026, 1, 1, tzinfo=UTC)}
+    return Round.model_validate({**fields, **ids, **moment, "diagnostics": diagnostics})
+
+
+def test_warnings_are_lines_that_name_project_and_round_and_cannot_command_a_terminal() -> None:
+    shown = warned("The score does not rank.", "The inverse model knows too little of \x1b[2Jswap.")
+    assert warning_lines("kitchen", shown) == [
+        "kitchen, round 2: The score does not rank.",
+        "kitchen, round 2: The inverse model knows too little of \\u001b[2Jswap.",
+    ]
+    assert warning_lines("kitchen", warned()) == []
+    assert warning_lines("kitchen", shown.model_copy(update={"diagnostics": None})) == []

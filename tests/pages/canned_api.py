@@ -19,7 +19,16 @@ from api_schemas.environments import Environment
 from api_schemas.events import Event
 from api_schemas.jobs import Job, JobState
 from api_schemas.projects import Budget, LabelingPolicy, PoolCounts, Project
-from api_schemas.rounds import GroupError, ModelError, ModelErrorCurve, ModelErrorPoint, Round, RoundStatus, Stage
+from api_schemas.rounds import (
+    Diagnostics,
+    GroupError,
+    ModelError,
+    ModelErrorCurve,
+    ModelErrorPoint,
+    Round,
+    RoundStatus,
+    Stage,
+)
 from service.dashboard.page import router
 
 START = datetime(2026, 11, 22, 9, 0, tzinfo=UTC)
@@ -57,14 +66,17 @@ class CannedApi:
         self.projects.append(project)
         return project.id
 
-    def add_round(self, project: UUID, loss: float | None, status: RoundStatus = "current") -> Round:
+    def add_round(
+        self, project: UUID, loss: float | None, status: RoundStatus = "current", warnings: list[str] | None = None
+    ) -> Round:
         own = [each for each in self.rounds if each.project == project]
         number = len(own) + 1
         done, over = status in ("current", "superseded"), status in ("current", "superseded", "failed", "cancelled")
         round_ = Round(
             id=uuid4(), project=project, number=number, watermark=100 * number, labels=100 * number, status=status,
             stages=[Stage(name="inverse_dynamics", seconds=14.2), Stage(name="world_model", seconds=48.75)], models={},
-            model_error=None if loss is None else model_error(loss), job=uuid4(),
+            model_error=None if loss is None else model_error(loss),
+            diagnostics=None if warnings is None else diagnostics(warnings), job=uuid4(),
             error="segment 3f at 12: loss is nan" if status == "failed" else None,
             created_at=START + timedelta(minutes=20 * number),
             finished_at=START + timedelta(minutes=20 * number + 4) if over else None,
@@ -123,6 +135,12 @@ def model_error(loss: float) -> ModelError:
     return ModelError(
         transitions=200, loss=loss, dynamics_accuracy=1 - 0.1 * loss, inverse_accuracy=0.93, by_group=groups
     )
+
+
+def diagnostics(warnings: list[str]) -> Diagnostics:
+    """Diagnostics that say only this."""
+    nothing = dict.fromkeys(("mask", "support", "aliasing", "back_action", "back_action_in_support", "ranking"))
+    return Diagnostics.model_validate({**nothing, "sampled": 0, "actions": [], "warnings": warnings})
 
 
 def application(api: CannedApi) -> FastAPI:

@@ -123,6 +123,22 @@ def test_a_project_without_a_model_family_says_that_it_trains_nothing(api: Canne
     expect(page.locator("#labels .big")).to_have_text("20 of 500 spent")
 
 
+def test_what_the_current_rounds_diagnostics_warn_of_stands_beside_it(api: CannedApi, site: Site, page: Page) -> None:
+    project = api.add_project("arm", labeled=200)
+    left = "The verifier has left its support: 41 % of the pool's segments show it something that no label shows."
+    knows_too_little = f"The inverse model knows too little of {HOSTILE}: 3 labels, 40 % right on held-out segments."
+    api.add_round(project, 2.5, warnings=["long gone"])
+    api.add_round(project, 2.0, warnings=[left, knows_too_little])
+    page.goto(f"{site.address}/dashboard")
+    expect(page.get_by_role("list", name="Warnings of round 2").get_by_role("listitem")).to_have_text(
+        [left, knows_too_little]
+    )
+    assert page.locator("img").count() == 0
+    api.add_round(project, 1.5, warnings=[])
+    expect(page.locator("#round .big")).to_have_text("3 current")
+    expect(page.locator("#round .warnings")).to_have_count(0)
+
+
 def test_a_second_project_is_overlaid_and_the_address_keeps_it(api: CannedApi, site: Site, page: Page) -> None:
     chosen, other = api.add_project("cycle", labeled=200), api.add_project("random", labeled=100)
     for project, losses in ((chosen, (2.0, 1.2)), (other, (2.6, 2.2, 2.0))):

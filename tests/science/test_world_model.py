@@ -17,7 +17,7 @@ def test_the_world_model_fits_a_small_set(training_set: SegmentBatch) -> None:
     generator = torch.Generator().manual_seed(0)
     model = GRID.build_world_model(toy_grid.SPACES, None, generator)
     small = training_set.take(slice(0, 100))
-    train(model, small, TrainingConfig(250, 32, 1e-2, 1e-4), generator)
+    train(model, small, TrainingConfig(750, 32, 1e-2, 1e-4), generator)
     error = evaluate(model, small, toy_grid.GROUPS)
     assert error.overall.dynamics_accuracy is not None
     assert error.overall.dynamics_accuracy >= 0.98

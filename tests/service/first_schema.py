@@ -8,7 +8,6 @@ from uuid import UUID
 from sqlalchemy import Connection, MetaData, create_engine, pool
 
 from api_schemas.environments import Environment
-from api_schemas.projects import LabelingPolicy
 
 Json = dict[str, Any]
 Rows = dict[str, list[Json]]
@@ -16,6 +15,7 @@ THEN = datetime(2025, 6, 1, tzinfo=UTC)
 LATER = THEN + timedelta(days=3650)
 FIRST, SECOND, EMPTY = (UUID(int=1000 * number) for number in (1, 2, 3))
 NAMES = tuple(letter * 64 for letter in "abc")
+POLICY: Json = {"strategy": "cycle", "round_labels": 0, "label_budget": 10, "lease_seconds": 3600.0}
 # project: by trajectory its split, its segments, and the starts that are labeled
 MEMBERS: dict[UUID, dict[str, tuple[str, int, list[int]]]] = {
     FIRST: {"a": ("pool", 5, [0, 3]), "b": ("pool", 7, []), "c": ("held_out", 4, [2])},
@@ -102,7 +102,15 @@ def _shown(row: Json) -> Json:
     naive = {
         name: value.astimezone(UTC).replace(tzinfo=None) if value.tzinfo else value for name, value in times.items()
     }
-    return dict(sorted((shown | naive).items()))
+    return dict(sorted((shown | naive | _policy(row)).items()))
+
+
+def _policy(row: Json) -> Json:
+    """A labeling policy in the first schema's words: batches were diverse or not."""
+    policy = dict(row.get("policy", {}))
+    if "batch_rule" in policy:
+        policy["diversify"] = policy.pop("batch_rule") != "top"
+    return {"policy": dict(sorted(policy.items()))} if policy else {}
 
 
 def _at(time: datetime = THEN) -> Json:
@@ -122,7 +130,7 @@ def _project(project: UUID, number: int) -> Rows:
         "stride": 1,
         "held_out_fraction": 0.1,
         "seed": number,
-        "policy": LabelingPolicy(round_labels=0, label_budget=10).model_dump(mode="json"),
+        "policy": POLICY | {"diversify": number == 0},
         "label_watermark": len(labeled),
         "labels_at_round": 1,
         "pool_labels": sum(split == "pool" for split, _ in labeled),

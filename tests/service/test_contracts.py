@@ -15,8 +15,16 @@ from api_schemas.environments import (
     Spaces,
     Stream,
 )
-from api_schemas.strategies import CATALOG, COLD_START_STRATEGY, DEFAULT_STRATEGY, STRATEGY_NAMES
-from models.acquisition import STRATEGIES
+from api_schemas.strategies import (
+    BATCH_RULE_NAMES,
+    CATALOG,
+    COLD_START_STRATEGY,
+    DEFAULT_BATCH_RULE,
+    DEFAULT_STRATEGY,
+    PRIVILEGED,
+    STRATEGY_NAMES,
+)
+from models.acquisition import BATCH_RULES, STRATEGIES
 from models.acquisition.base import Models
 from workers.simulators import minigrid
 from workers.simulators.base import OptionError
@@ -85,10 +93,10 @@ def test_strategies_are_those_of_the_science() -> None:
     for strategy in CATALOG:
         implemented = STRATEGIES[strategy.name]
         assert strategy.privileged == implemented.privileged
-        assert set(strategy.needs) >= implemented.needs
+        assert set(strategy.needs) == implemented.needs
         assert set(strategy.needs) <= set(Models.__dataclass_fields__)
-        assert bool(strategy.needs) == bool(implemented.needs)
-    assert {DEFAULT_STRATEGY, COLD_START_STRATEGY} <= set(STRATEGY_NAMES)
+    assert {DEFAULT_STRATEGY, COLD_START_STRATEGY} <= set(STRATEGY_NAMES) - PRIVILEGED
+    assert set(BATCH_RULE_NAMES) == set(BATCH_RULES) >= {DEFAULT_BATCH_RULE}
     assert not STRATEGIES[COLD_START_STRATEGY].needs
 
 

@@ -16,10 +16,11 @@ from alembic.migration import MigrationContext
 from sqlalchemy import Engine, create_engine, inspect, pool, select, text
 from sqlalchemy.exc import DBAPIError
 
+from service import projects
 from service.settings import Settings
 from service.store.columns import Row
 from service.store.database import migrate, open_database
-from service.store.tables import EventEpochRow
+from service.store.tables import EventEpochRow, ProjectRow
 from tests.service.first_schema import EMPTY, FIRST, NAMES, SECOND, fill, narrowed, read, write
 from tests.service.kit import Served, serve
 
@@ -131,7 +132,9 @@ def test_the_first_schema_is_upgraded_with_its_data_and_counted(url: str) -> Non
     assert {row["mode"] for row in after["acquisition"]} == {"pool"}
     assert {(row["actor"], row["correlation"], row["transaction"]) for row in after["event"]} == {("", "", 0)}
     assert {(row["correlation"], row["checkpoint_stage"]) for row in after["job"]} == {("", None)}
+    assert {row["diagnostics"] for row in after["round"]} == {None}
     assert after["idempotency"] == []
+    assert _rules(url) == {FIRST: "kmeans_plus_plus", SECOND: "top", EMPTY: "top"}
     _check_references(url)
 
 
@@ -184,6 +187,15 @@ def _check_service(served: Served) -> None:
     assert served.get(f"/acquisitions/{lease['id']}")["status"] == "labeled"
 
 
+def _rules(url: str) -> dict[UUID, str]:
+    """What became of policies that said whether batches are diverse."""
+    database = open_database(url)
+    with database.read() as session:
+        found = {row.id: projects.policy_of(row).batch_rule for row in session.scalars(select(ProjectRow))}
+    database.close()
+    return dict(found)
+
+
 def test_going_back_keeps_all_that_the_first_schema_knows(url: str) -> None:
     migrate(url, "0001")
     before, schema = fill(url), _schema(url)
@@ -223,6 +235,23 @@ def test_going_back_says_what_is_new_in_the_first_schemas_words(url: str) -> Non
     assert labeled.hex not in statuses
     assert labeled.hex not in {row["acquisition_id"] for row in after["acquisition_item"]}
     assert after["label"] == before["label"]  # also those that the forgotten acquisition brought
+    _check_references(url)
+    migrate(url)
+    assert _differences(url) == []
+
+
+def test_going_back_before_the_diagnostics_forgets_them_alone(url: str) -> None:
+    migrate(url, "0001")
+    fill(url)
+    migrate(url, "0003")
+    before, schema = read(url), _schema(url)
+    migrate(url, "0004")
+    filled = {name: rows for name, rows in before.items() if rows}
+    assert narrowed(read(url), filled) == filled
+    write(url, """UPDATE round SET diagnostics = '{"sampled": 7}'""")
+    assert [row["diagnostics"] for row in read(url)["round"]] == 2 * [{"sampled": 7}]
+    _downgrade(url, "0003")
+    assert (_version(url), _schema(url), read(url)) == ("0003", schema, before)
     _check_references(url)
     migrate(url)
     assert _differences(url) == []

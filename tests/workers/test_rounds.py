@@ -23,7 +23,7 @@ from workers.stage import Stage
 from workers.training import BASE
 
 Train = Callable[..., TrainingState]
-STAGES = ["inverse_dynamics", "world_model", "evaluation"]
+STAGES = ["inverse_dynamics", "world_model", "evaluation", "diagnostics"]
 
 
 def hashes(loop: Loop, of: Round) -> dict[str, str]:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from sqlalchemy import event
 
-from models.acquisition import STRATEGIES
+from models.acquisition import BATCH_RULES, STRATEGIES
 from models.acquisition.base import score_pool
 from service import scorings
 from service.settings import Settings
@@ -83,7 +83,9 @@ def test_scores_are_those_of_the_strategy_on_the_rounds_networks(opened: OpenLoo
     found = newest(loop, "cycle")
     with loop.worker.database.read() as session:
         project = session.get_one(ProjectRow, loop.project.id)
-        models = scoring.load_models(loop.worker.database, loop.blobs, project, found.round_id)
+        models = scoring.load_models(
+            loop.worker.database, loop.blobs, project, found.round_id, STRATEGIES["cycle"].needs
+        )
         windows = data.windows_of(session, project, pool_queries.memberships(session, project.id, "pool"), None)
     batch = data.load(loop.blobs, windows, 1)
     direct = score_pool(STRATEGIES["cycle"], models, batch, torch.Generator())
@@ -95,8 +97,8 @@ def test_scores_are_those_of_the_strategy_on_the_rounds_networks(opened: OpenLoo
     assert all(score == scores[segment] for segment, score in queue_of(loop, found.id))
 
 
-def test_without_diversification_the_queue_is_the_order_of_scores(trained: Loop) -> None:
-    trained.change(diversify=False)
+def test_under_top_the_queue_is_the_order_of_scores(trained: Loop) -> None:
+    trained.change(batch_rule="top")
     trained.label(3)
     trained.train()
     scores = [score for _, score in queue_of(trained, newest(trained, "cycle").id)]
@@ -105,15 +107,15 @@ def test_without_diversification_the_queue_is_the_order_of_scores(trained: Loop)
     assert best == scores[:10]
 
 
-def test_a_diverse_queue_holds_the_same_segments_in_another_order(trained: Loop) -> None:
+def test_every_batch_rule_queues_the_same_segments_in_its_own_order(trained: Loop) -> None:
     ranked = []
-    for diversify in (True, False):
-        trained.change(diversify=diversify)
+    for rule in BATCH_RULES:
+        trained.change(batch_rule=rule)
         trained.client.start_round(trained.project.id)
         trained.drain()
         ranked.append([segment for segment, _ in queue_of(trained, newest(trained, "cycle").id)])
-    assert set(ranked[0]) == set(ranked[1])
-    assert ranked[0] != ranked[1]
+    assert all(set(each) == set(ranked[0]) for each in ranked)
+    assert len({tuple(each) for each in ranked}) == len(BATCH_RULES)
 
 
 def test_labeled_and_leased_segments_are_not_queued(trained: Loop) -> None:

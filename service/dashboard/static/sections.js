@@ -54,7 +54,14 @@ function firstRound(project) {
 function currentRound(round) {
   return h("div", {},
     h("p", { class: "big" }, count(round.number), " ", badge(round.status)),
-    h("p", { class: "hint" }, `${plural(round.labels, "label")}, `, round.finished_at ? when(round.finished_at) : when(round.created_at)));
+    h("p", { class: "hint" }, `${plural(round.labels, "label")}, `, round.finished_at ? when(round.finished_at) : when(round.created_at)),
+    warnings(round));
+}
+
+// Where the round's diagnostics say that the method does not hold.
+function warnings(round) {
+  const sentences = round.diagnostics?.warnings ?? [];
+  return sentences.length ? h("ul", { class: "warnings", "aria-label": `Warnings of round ${round.number}` }, ...sentences.map((each) => h("li", {}, each))) : null;
 }
 
 function workingRound(round, job) {

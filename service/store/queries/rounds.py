@@ -37,6 +37,17 @@ def models_of(session: Session, round_id: UUID) -> Sequence[ModelVersionRow]:
     return session.scalars(statement.order_by(ModelVersionRow.kind, ModelVersionRow.member)).all()
 
 
+def previous_world_model(session: Session, row: RoundRow) -> ModelVersionRow | None:
+    """The world model of the last round before this one that trained one."""
+    statement = (
+        select(ModelVersionRow)
+        .join(RoundRow, RoundRow.id == ModelVersionRow.round_id)
+        .where(RoundRow.project_id == row.project_id, RoundRow.number < row.number)
+        .where(ModelVersionRow.kind == "world_model")
+    )
+    return session.scalar(statement.order_by(RoundRow.number.desc()).limit(1))
+
+
 def newest_model(session: Session, project_id: UUID, kind: str) -> ModelVersionRow | None:
     """The youngest network of a kind."""
     statement = select(ModelVersionRow).where(ModelVersionRow.project_id == project_id, ModelVersionRow.kind == kind)

@@ -1,0 +1,289 @@
+"""Diagnostics: does the method hold here? The four conditions of the paper's appendix D, and whether the score ranks.
+
+The inverse dynamics verifies what it reads, the block z_S: few coordinates of many (mask), near to labeled ones
+(support), from which one action follows (aliasing), whatever the rest of the world is like (back-action).
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from models.cycle_consistency import cycle
+from models.inverse_dynamics.base import DiscreteInverseDynamics, VerifyingBlock
+from models.rank_correlation import kendall, spearman
+from models.segments import SegmentBatch, first
+from models.spaces import DiscreteAction
+from models.support import AfterEach, nearest, whole_observation
+from models.world_models.base import WorldModel
+
+CHUNK = 256  # segments a forward pass
+
+
+@dataclass(frozen=True)
+class Mask:
+    """How many coordinates of an observation the inverse dynamics reads, mean over segments, and how many there are."""
+
+    kept: float
+    coordinates: int
+
+
+@dataclass(frozen=True)
+class Support:
+    """Distance of pool segments' z_S to the nearest labeled one: of one-hot codes, how many differ.
+
+    outside: share of segments that differ at all from every label. A segment is as far as its farthest step.
+    """
+
+    outside: float
+    mean: float
+    percentile_95: float
+
+
+@dataclass(frozen=True)
+class Aliasing:
+    """Entropy in nats of the inferred actions of pool steps; above_ln_2: share with more doubt than between two."""
+
+    mean: float
+    percentile_95: float
+    above_ln_2: float
+
+
+@dataclass(frozen=True)
+class BackAction:
+    """Share of held-out steps whose action is inferred wrong, by how far their unmasked coordinates are from labels.
+
+    nearest, farthest: of the steps up to the first and from the second third of the distances on. spearman: of
+    distance and error, None where all distances or all errors are equal.
+    """
+
+    steps: int
+    nearest: float
+    farthest: float
+    spearman: float | None
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Rank correlation of score and true loss over held-out segments; None where nothing can be ranked."""
+
+    segments: int
+    spearman: float | None
+    kendall: float | None
+
+
+@dataclass(frozen=True)
+class KnownAction:
+    """What is known of an action, over the steps that it alone explains: any of several would tell little of each.
+
+    labels: such steps in the training set. held_out: in the held-out set; accuracy: share of them inferred right.
+    """
+
+    labels: int
+    held_out: int
+    accuracy: float | None
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """Of one round. sampled: pool segments that were looked at; what needs labels or segments that lack is None.
+
+    back_action_in_support: over the steps whose z_S some label shows. There a rise is the rest's doing alone; over all
+    steps the kinds of steps that the labels lack may lie near or far themselves.
+    """
+
+    sampled: int
+    mask: Mask | None
+    support: Support | None
+    aliasing: Aliasing | None
+    back_action: BackAction | None
+    back_action_in_support: BackAction | None
+    ranking: Ranking | None
+    ranking_by_group: dict[str, Ranking]
+    actions: tuple[KnownAction, ...]
+
+
+@dataclass(frozen=True)
+class _HeldOut:
+    """Over held-out segments: score (B,), true loss (B,), inferred action is among those that explain (B, L)."""
+
+    score: Tensor
+    loss: Tensor
+    right: Tensor
+
+
+@torch.inference_mode()
+def diagnose(
+    world_model: WorldModel,
+    inverse_dynamics: DiscreteInverseDynamics,
+    labeled: SegmentBatch,
+    pool: SegmentBatch | None,
+    held_out: SegmentBatch | None,
+    groups: Mapping[str, set[int]],
+    after_each: AfterEach = lambda: None,
+) -> Diagnostics:
+    """All figures, on the models' device. Nothing is drawn and nothing trained.
+
+    labeled: what the round trained on. pool: a sample of the unlabeled segments. held_out: labeled held-out segments.
+    groups: name -> actions; a segment belongs to those that any of its actions is in. Raises ValueError for labeled
+    or held-out segments without actions, for an action space that is not discrete, and for a score or loss that is not
+    finite, naming its segment.
+    """
+    held = None if held_out is None else _held_out(world_model, inverse_dynamics, held_out, after_each)
+    members = {} if held_out is None else {name: _in_group(held_out, actions) for name, actions in groups.items()}
+    back_action, in_support = _back_action(inverse_dynamics, labeled, held_out, held, after_each)
+    return Diagnostics(
+        sampled=0 if pool is None else pool.size,
+        mask=None if pool is None else _mask(inverse_dynamics, pool),
+        support=None if pool is None else _support(inverse_dynamics, labeled, pool, after_each),
+        aliasing=None if pool is None else _aliasing(inverse_dynamics, pool, after_each),
+        back_action=back_action,
+        back_action_in_support=in_support,
+        ranking=None if held is None else _ranking(held.score, held.loss),
+        ranking_by_group={}
+        if held is None
+        else {name: _ranking(held.score[chosen], held.loss[chosen]) for name, chosen in members.items()},
+        actions=_known_actions(explanations(inverse_dynamics, labeled), inverse_dynamics, held_out, held),
+    )
+
+
+def true_loss(world_model: WorldModel, batch: SegmentBatch, sets: Tensor) -> Tensor:
+    """The world model's distance under the true actions, of those in `sets` (B, L, n) the ones it is best at: (B,).
+
+    All actions in the set of a step are true, so the world model errs by its smallest distance over them. Of longer
+    segments each step's action is chosen before the next is predicted, which for L = 1 is the minimum itself.
+    """
+    state, total = world_model.infer_state(first(batch.observations)), torch.zeros(batch.size, device=sets.device)
+    for step in range(batch.length):
+        rows, actions = sets[:, step].nonzero(as_tuple=True)  # every pair of a segment and an action of its set, (P,)
+        prediction = world_model.rollout(state[rows], actions.unsqueeze(1))  # (P, 1, ...)
+        after = {name: stream[rows, step + 1].unsqueeze(1) for name, stream in batch.observations.items()}
+        distance = world_model.distance(prediction, after)
+        table = distance.new_full(sets[:, step].shape, torch.inf)
+        table[rows, actions] = distance
+        best, action = table.min(1)
+        places = (sets[:, step].flatten().cumsum(0) - 1).view_as(sets[:, step])
+        state = prediction[places.gather(1, action.unsqueeze(1)).squeeze(1), 0]
+        total = total + best
+    return total
+
+
+def explanations(inverse_dynamics: DiscreteInverseDynamics, batch: SegmentBatch) -> Tensor:
+    """The actions that explain each step, bool (B, L, n): the label's set, else its action alone.
+
+    Raises ValueError for a batch without actions, and for an action space that is not discrete.
+    """
+    space = inverse_dynamics.spaces.action
+    if not isinstance(space, DiscreteAction):
+        raise ValueError(f"Diagnostics need a discrete action space, got {space}.")
+    if batch.actions is None:
+        raise ValueError("Diagnostics need labeled segments; the batch carries no actions.")
+    return (
+        torch.nn.functional.one_hot(batch.actions, space.n).bool() if batch.action_sets is None else batch.action_sets
+    )
+
+
+def _mask(inverse_dynamics: DiscreteInverseDynamics, pool: SegmentBatch) -> Mask:
+    kept = torch.cat([inverse_dynamics.kept(part.observations) for part in _chunks(pool)])
+    return Mask(float(kept.double().mean()), inverse_dynamics.coordinates)
+
+
+def _support(
+    inverse_dynamics: DiscreteInverseDynamics, labeled: SegmentBatch, pool: SegmentBatch, after_each: AfterEach
+) -> Support:
+    # A model that does not say what it reads: all of the observation, which finds more segments new than are to it.
+    describe = whole_observation(labeled.observations, pool.observations)
+    if isinstance(inverse_dynamics, VerifyingBlock):
+        describe, labeled = inverse_dynamics.verifying_block, inverse_dynamics.views(labeled)
+    distance = nearest(describe, pool, labeled, after_each).view(pool.size, pool.length).amax(1).double()
+    return Support(float((distance > 0).double().mean()), float(distance.mean()), float(distance.quantile(0.95)))
+
+
+def _aliasing(inverse_dynamics: DiscreteInverseDynamics, pool: SegmentBatch, after_each: AfterEach) -> Aliasing:
+    parts = []
+    for part in _chunks(pool):
+        parts.append(torch.special.entr(inverse_dynamics.log_prob(part).exp()).sum(-1).flatten())
+        after_each()
+    entropy = torch.cat(parts).double()
+    above = float((entropy > math.log(2)).double().mean())
+    return Aliasing(float(entropy.mean()), float(entropy.quantile(0.95)), above)
+
+
+def _back_action(
+    inverse_dynamics: DiscreteInverseDynamics,
+    labeled: SegmentBatch,
+    held_out: SegmentBatch | None,
+    held: _HeldOut | None,
+    after_each: AfterEach,
+) -> tuple[BackAction | None, BackAction | None]:
+    """Over all steps and over those in support; None also where nothing is left out, or the model does not say what."""
+    if held_out is None or held is None or not isinstance(inverse_dynamics, VerifyingBlock):
+        return None, None
+    if not inverse_dynamics.rest(held_out.take(slice(0, 1)).observations).shape[1]:
+        return None, None
+    views = inverse_dynamics.views(labeled)
+    rest = nearest(inverse_dynamics.rest, held_out, views, after_each).double()
+    inside = nearest(inverse_dynamics.verifying_block, held_out, views, after_each) == 0
+    wrong = 1.0 - held.right.flatten().double()
+    return _error_by_distance(rest, wrong), _error_by_distance(rest[inside], wrong[inside])
+
+
+def _error_by_distance(distance: Tensor, wrong: Tensor) -> BackAction | None:
+    if not len(distance):
+        return None
+    low, high = distance.quantile(1 / 3), distance.quantile(2 / 3)  # ties stay together, so no order decides
+    near, far = float(wrong[distance <= low].mean()), float(wrong[distance >= high].mean())
+    return BackAction(len(distance), near, far, spearman(distance, wrong))
+
+
+def _held_out(
+    world_model: WorldModel, inverse_dynamics: DiscreteInverseDynamics, held_out: SegmentBatch, after_each: AfterEach
+) -> _HeldOut:
+    parts = []
+    for part in _chunks(held_out):
+        sets = explanations(inverse_dynamics, part)
+        inferred, score = cycle(world_model, inverse_dynamics, part.observations)
+        right = sets.gather(2, inferred.unsqueeze(2)).squeeze(2)
+        loss = true_loss(world_model, part, sets)
+        _require_finite(part, score, loss)
+        parts.append((score, loss, right))
+        after_each()
+    return _HeldOut(*(torch.cat(each) for each in zip(*parts, strict=True)))
+
+
+def _require_finite(batch: SegmentBatch, score: Tensor, loss: Tensor) -> None:
+    bad = (~torch.isfinite(score + loss)).nonzero().flatten().tolist()
+    if bad:
+        named = batch.segments[bad[0]] if batch.segments else f"row {bad[0]}"
+        raise ValueError(f"Held-out {named} has score {float(score[bad[0]])} and true loss {float(loss[bad[0]])}.")
+
+
+def _ranking(score: Tensor, loss: Tensor) -> Ranking:
+    return Ranking(len(score), spearman(score, loss), kendall(score, loss))
+
+
+def _known_actions(
+    labels: Tensor, inverse_dynamics: DiscreteInverseDynamics, held_out: SegmentBatch | None, held: _HeldOut | None
+) -> tuple[KnownAction, ...]:
+    alone = labels[labels.sum(-1) == 1].sum(0).tolist()  # (B, L, n) -> (n,)
+    if held_out is None or held is None:
+        return tuple(KnownAction(count, 0, None) for count in alone)
+    sets = explanations(inverse_dynamics, held_out)
+    unique = sets.sum(-1) == 1  # (B, L)
+    asked, right = sets[unique].sum(0).tolist(), sets[unique & held.right].sum(0).tolist()
+    return tuple(
+        KnownAction(count, of, good / of if of else None) for count, of, good in zip(alone, asked, right, strict=True)
+    )
+
+
+def _in_group(batch: SegmentBatch, actions: set[int]) -> Tensor:
+    """Segments (B,) of which any action is in the group."""
+    if batch.actions is None:
+        raise ValueError("Diagnostics need labeled segments; the batch carries no actions.")
+    return torch.isin(batch.actions, torch.tensor(sorted(actions), device=batch.actions.device)).any(1)
+
+
+def _chunks(batch: SegmentBatch) -> Iterator[SegmentBatch]:
+    return (batch.take(slice(start, start + CHUNK)) for start in range(0, batch.size, CHUNK))
