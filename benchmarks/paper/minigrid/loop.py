@@ -1,0 +1,177 @@
+"""The active-learning loop offline: what a project of the service does, straight on models/, draw for draw.
+
+Training, scoring, batch rules, labels and the names of all draws are the service's own, so one seed gives the picks of
+a project of that seed. No database, no HTTP and no files but the networks of the first round, which all arms share.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.paper.minigrid.arms import Arm
+from benchmarks.paper.minigrid.datasets import GROUPS, draw_labels
+from models import checkpoints
+from models.acquisition import STRATEGIES, Models, describe, score_pool, top
+from models.chance import scoring_generator, training_generator
+from models.diagnostics import explanations, true_loss
+from models.evaluation import ModelError, evaluate
+from models.families import GRID
+from models.network import Network
+from models.segments import SegmentBatch, concatenate
+from models.spaces import Spaces
+from models.training import train
+from workers.data import CHUNK_SEGMENTS
+from workers.training import BASE, ENSEMBLE_MEMBERS
+
+Networks = dict[tuple[str, int], Network]  # by kind and member
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many labels at first, how many a batch, how many batches; the length of the ranked queue."""
+
+    seed_labels: int = 200
+    batch_labels: int = 100
+    batches: int = 3
+    queue_length: int = 2000
+
+
+@dataclass(frozen=True)
+class Round:
+    """What a round is after its training: labels so far, networks, and what is then picked (rows of the pool)."""
+
+    number: int
+    labeled: SegmentBatch
+    models: Models
+    picks: Tensor
+    scores: Tensor  # (N,) of the whole pool
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One arm from one seed. pool: unlabeled segments with their hidden action sets, in the order of membership."""
+
+    arm: Arm
+    seed: int
+    spaces: Spaces
+    pool: SegmentBatch
+    shared: Path | None = None  # folder for the first round's networks
+    plan: Plan = Plan()
+
+    def rounds(self) -> Iterator[Round]:
+        """`batches` + 1 rounds; the last one picks nothing."""
+        rng = np.random.default_rng(self.seed)  # of the labeling worker
+        free = torch.ones(self.pool.size, dtype=torch.bool)
+        labeled, previous = list[SegmentBatch](), None
+        picks = self._first_picks()
+        for number in range(1, self.plan.batches + 2):
+            free[picks] = False
+            labeled.append(draw_labels(self.pool.take(picks), rng))
+            everything = concatenate(labeled)
+            models = replace(self._trained(number, everything), previous_world_model=previous)
+            scores = self._scores(number, models)
+            last = number == self.plan.batches + 1
+            picks = torch.zeros(0, dtype=torch.int64) if last else self._picks(number, models, scores, free)
+            yield Round(number, everything, models, picks, scores)
+            previous = models.world_model
+
+    @property
+    def trajectories(self) -> int:
+        """How many the pool's segments come from."""
+        return len({segment.trajectory for segment in self.pool.segments})
+
+    def _first_picks(self) -> Tensor:
+        """Before any model there is only chance, the same for all arms of a seed."""
+        return top(self._uniform(), self.plan.seed_labels)
+
+    def _uniform(self) -> Tensor:
+        generator = scoring_generator(self.seed, "random", 0, self.trajectories, "shard 0")
+        return torch.rand(self.pool.size, generator=generator)
+
+    def _trained(self, number: int, labeled: SegmentBatch) -> Models:
+        kinds = (BASE | self.arm.scores.needs) - {"previous_world_model"}
+        networks: Networks = {}
+        for kind in sorted(kinds):
+            for member in range(ENSEMBLE_MEMBERS if kind == "ensemble" else 1):
+                networks[kind, member] = self._network(number, kind, member, labeled)
+        single = {kind: network for (kind, _), network in networks.items() if kind != "ensemble"}
+        ensemble = tuple(network for (kind, _), network in networks.items() if kind == "ensemble")
+        return Models(**single, ensemble=ensemble)  # type: ignore[arg-type]  # kinds are the fields of Models
+
+    def _network(self, number: int, kind: str, member: int, labeled: SegmentBatch) -> Network:
+        """The subgoal generator and the first round's networks do not depend on the arm: they are kept and shared."""
+        if kind == "subgoal_generator":
+            number, labeled = 0, self.pool.without_labels()
+        kept = self.shared / f"seed-{self.seed}-{kind}-{member}.safetensors" if self.shared and number < 2 else None
+        if kept is not None and kept.exists():
+            return checkpoints.load(kept.read_bytes())
+        built = "world_model" if kind == "ensemble" else kind
+        generator = training_generator(self.seed, number, kind, member)
+        network = GRID.build(built, self.spaces, {}, generator)
+        train(network, labeled, GRID.training_config(built, labeled.size), generator)
+        if kept is not None:
+            _keep(network, kept)
+        return network
+
+    def _scores(self, number: int, models: Models) -> Tensor:
+        """(N,), in the parts in which a scoring job reads the pool: sums of floats depend on how they are cut."""
+        if not self.arm.scores.needs:
+            return self._uniform()
+        generator = scoring_generator(self.seed, self.arm.strategy, number, self.trajectories, "shard 0")
+        seen = self.pool if self.arm.scores.privileged else self.pool.without_labels()
+        strategy = self.arm.scores
+        if strategy.privileged:  # never scored by the service; some need the whole pool at once
+            return score_pool(strategy, models, draw_labels(seen, np.random.default_rng(self.seed)), generator).float()
+        return torch.cat([score_pool(strategy, models, part, generator) for part in parts_of(seen)]).float()
+
+    def _picks(self, number: int, models: Models, scores: Tensor, free: Tensor) -> Tensor:
+        ranked = top(scores, len(scores))
+        candidates = ranked[free[ranked]][: self.plan.queue_length]
+        strategy, rule = self.arm.scores, self.arm.orders
+        if not strategy.needs:
+            return candidates[: self.plan.batch_labels]
+        generator = scoring_generator(self.seed, self.arm.strategy, number, self.trajectories, "selection 0")
+        described = describe(rule, strategy, models, self.pool.take(candidates), scores[candidates])
+        return candidates[rule.order(described, len(candidates), generator)][: self.plan.batch_labels]
+
+
+def parts_of(pool: SegmentBatch) -> Iterator[SegmentBatch]:
+    """Whole trajectories, about CHUNK_SEGMENTS segments a part, as workers read them."""
+    start, names = 0, pool.segments
+    for place in range(1, pool.size + 1):
+        ends = place == pool.size or names[place].trajectory != names[place - 1].trajectory
+        if ends and (place - start >= CHUNK_SEGMENTS or place == pool.size):
+            yield pool.take(slice(start, place))
+            start = place
+
+
+def errors(models: Models, tests: Mapping[str, SegmentBatch]) -> dict[str, ModelError]:
+    """Model error on each labeled test set."""
+    assert models.world_model is not None
+    return {name: evaluate(models.world_model, test, GROUPS, models.inverse_dynamics) for name, test in tests.items()}
+
+
+def pool_losses(models: Models, pool: SegmentBatch) -> Tensor:
+    """The true loss (N,) of each segment, the smallest over the actions that explain it."""
+    assert models.world_model is not None
+    inverse = models.inverse_dynamics
+    assert inverse is not None
+    with torch.inference_mode():
+        parts = [true_loss(models.world_model, part, explanations(inverse, part)) for part in parts_of(pool)]
+    return torch.cat(parts)
+
+
+def _keep(network: Network, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(f".{id(network)}")
+    unfinished.write_bytes(checkpoints.save(network))
+    unfinished.replace(path)
+
+
+def strategy_scores(strategy: str, models: Models, batch: SegmentBatch) -> Tensor:
+    """Scores (B,) of a strategy that draws nothing."""
+    return score_pool(STRATEGIES[strategy], models, batch, torch.Generator())
