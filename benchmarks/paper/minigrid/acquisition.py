@@ -2,129 +2,85 @@
 
     python -m benchmarks.paper.minigrid.acquisition --arms cycle:kmeans_plus_plus random:top --seeds 5
 
-An arm is `strategy:rule`. All arms get the same pool, seed labels, budgets, schedules and draws. Each finished
-(arm, seed) is a JSON file in --out and is not run again. Processes share the machine's cores, one torch thread each.
+An arm is `strategy:rule`. All arms get the same pool, seed labels, budgets, schedules and draws.
 """
 
 import argparse
-import json
-import multiprocessing
-import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from benchmarks.figures import Figure, finish
+from benchmarks.paper.minigrid import acquisition_table
 from benchmarks.paper.minigrid.arms import Arm
-from benchmarks.paper.minigrid.datasets import ACTIONS, REPORTED, TUNING, DataSpec, draw_test_labels, load
-from benchmarks.paper.minigrid.loop import Experiment, Plan, Round, errors, pool_losses, strategy_scores
+from benchmarks.paper.minigrid.datasets import ACTIONS
+from benchmarks.paper.minigrid.loop import Experiment, Round, errors, pool_losses, strategy_scores
+from benchmarks.paper.minigrid.rooms import Rooms, add_files
+from benchmarks.paper.runs import Json, add_options, results, run_missing
 from models.diagnostics import explanations, true_loss
 from models.evaluation import transition_errors
 from models.rank_correlation import kendall, spearman
 from models.segments import SegmentBatch
 
-Json = dict[str, Any]
 MOVEMENT = 3  # actions below it are movements
+WITHOUT_RANKS = ("random", "no_score", "oracle_uniform", "fidelity")  # their scores are draws, or turn on the pool
+DEFAULT = Arm("cycle", "kmeans_plus_plus")
+ARMS = (Arm("random", "top"), DEFAULT, Arm("oracle", "top"), Arm("self_inverse", "kmeans_plus_plus"))
 
 
 @dataclass(frozen=True)
-class Data:
-    """The pool and the two test sets. All layouts of a test are of other seeds than the pool's."""
+class ArmRun:
+    """One arm from one seed. networks: folder of those that all arms share."""
 
-    pool: SegmentBatch
-    balanced: SegmentBatch
-    natural: SegmentBatch
+    arm: Arm
+    seed: int
+    rooms: Rooms
+    networks: Path
 
+    @property
+    def name(self) -> str:
+        """Of its file."""
+        return "-".join((self.arm.strategy, self.arm.rule, str(self.seed), *self.rooms.words))
 
-@dataclass(frozen=True)
-class DataChoice:
-    """Which rooms: the reported ones or those for tuning; `data_seed` chooses among either."""
-
-    folder: Path
-    tuning: bool = False
-    data_seed: int = 0
-    pool_transitions: int = 28_000
-    per_action: int = 500
-    natural_transitions: int = 6000
-
-    def load(self) -> Data:
-        """From files, made where they are not there yet."""
-        first = (TUNING if self.tuning else REPORTED) + 10 * self.data_seed
-        pool = DataSpec("mixture", self.pool_transitions, first + 1)
-        balanced = DataSpec("balanced", 200_000, first + 2, per_action=self.per_action)
-        natural = DataSpec("mixture", self.natural_transitions, first + 3)
-        return Data(
-            load(pool, self.folder),
-            draw_test_labels(load(balanced, self.folder)),
-            draw_test_labels(load(natural, self.folder)),
+    def results(self) -> Json:
+        """After every round: model error on each test, rank correlations, what was picked."""
+        data = self.rooms.load()
+        experiment = Experiment(
+            self.arm, self.seed, data.spaces, data.pool, self.networks, seed_set=data.seed_set, video=data.video
         )
+        rounds = [_told(self.arm, found, data.tests, data.pool) for found in experiment.rounds()]
+        return {"arm": self.arm.name, "seed": self.seed, "rounds": rounds}
 
 
-def main() -> None:
-    """Run what is missing and print the table."""
-    from benchmarks.paper.minigrid.acquisition_table import print_table
-
+def main(argv: Sequence[str] | None = None) -> list[Figure]:
+    """Run what is missing, print the table, draw the chart; the figures of the default arm with their targets."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--arms", nargs="+", default=["random:top", "cycle:kmeans_plus_plus"], type=Arm.parse)
+    add_options(parser, "4d")
+    add_files(parser)
+    parser.add_argument("--arms", nargs="+", default=list(ARMS), type=Arm.parse)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--processes", type=int, default=multiprocessing.cpu_count())
-    parser.add_argument("--threads", type=int, default=1, help="of torch, in each process")
-    parser.add_argument("--out", type=Path, default=Path("results/paper/minigrid/4d"))
-    parser.add_argument("--tuning", action="store_true", help="rooms that no table reports, to choose settings on")
-    parser.add_argument("--data-seed", type=int, default=0)
-    asked = parser.parse_args()
-    choice = DataChoice(asked.out / "data", asked.tuning, asked.data_seed)
-    run_missing(asked.arms, range(asked.seeds), choice, asked.out, asked.processes, asked.threads)
-    print_table(asked.arms, range(asked.seeds), asked.out)
+    asked = parser.parse_args(argv)
+    rooms = Rooms.of(asked)
+    # One arm first, so that no two train the shared networks; then by seeds, so that an unfinished run has all arms.
+    order = [(seed, asked.arms[0]) for seed in range(asked.seeds)]
+    order += [(seed, arm) for seed in range(asked.seeds) for arm in asked.arms[1:]]
+    runs = [ArmRun(arm, seed, rooms, asked.out / "networks") for seed, arm in order]
+    rooms.load()  # once, before processes ask for it
+    run_missing(runs, asked.out, asked.processes, asked.threads)
+    return acquisition_table.tell(results(runs, asked.out), DEFAULT, asked.out)
 
 
-def run_missing(
-    arms: Sequence[Arm], seeds: Sequence[int], choice: DataChoice, out: Path, processes: int, threads: int
-) -> None:
-    """Every (arm, seed) whose file is not there, seeds first so that an unfinished run compares all arms."""
-    tasks = [(arm, seed) for seed in seeds for arm in arms if not result_file(out, arm, seed).exists()]
-    if not tasks:
-        return
-    choice.load()  # once, before processes ask for it
-    context = multiprocessing.get_context("spawn")
-    began = time.monotonic()
-    with ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(threads,)) as pool:
-        futures = [pool.submit(run_arm, arm, seed, choice, out) for arm, seed in tasks]
-        for done, future in enumerate(as_completed(futures), 1):
-            print(f"{done} of {len(tasks)}, {time.monotonic() - began:.0f} s: {future.result()}", flush=True)
-
-
-def run_arm(arm: Arm, seed: int, choice: DataChoice, out: Path) -> str:
-    """One arm from one seed; its result is written at its end."""
-    data, began = choice.load(), time.monotonic()
-    experiment = Experiment(arm, seed, DataSpec("mixture", 1, TUNING).spaces, data.pool, out / "networks", Plan())
-    rounds = [_told(experiment, found, data) for found in experiment.rounds()]
-    result = {"arm": arm.name, "seed": seed, "seconds": time.monotonic() - began, "threads": torch.get_num_threads()}
-    path = result_file(out, arm, seed)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.with_suffix(".unfinished").write_text(json.dumps(result | {"rounds": rounds}))
-    path.with_suffix(".unfinished").replace(path)
-    return f"{arm.name} seed {seed}: " + ", ".join(f"{each['balanced']['overall']['loss']:.2f}" for each in rounds)
-
-
-def result_file(out: Path, arm: Arm, seed: int) -> Path:
-    """Where a result is kept."""
-    return out / f"{arm.strategy}-{arm.rule}-{seed}.json"
-
-
-def _told(experiment: Experiment, found: Round, data: Data) -> Json:
-    tests = {"balanced": data.balanced, "natural": data.natural}
+def _told(arm: Arm, found: Round, tests: dict[str, SegmentBatch], pool: SegmentBatch) -> Json:
     told: Json = {"labels": found.labeled.size}
     for name, error in errors(found.models, tests).items():
-        told[name] = {"overall": _short(asdict(error.overall))}
-        told[name] |= {group: _short(asdict(each)) for group, each in error.groups.items()}
-    told["inverse_by_action"] = _inverse_by_action(found, data.balanced)
-    told["ranks"] = _ranks(experiment.arm, found, data.natural)
-    told["picks"] = _picks(found, data.pool)
+        groups = {"overall": error.overall, **error.groups}
+        told[name] = {group: _short(asdict(each)) for group, each in groups.items()}
+    told["inverse_by_action"] = _inverse_by_action(found, tests["balanced"])
+    told["ranks"] = _ranks(arm, found, tests["natural"])
+    told["picks"] = _picks(found, pool)
     return told
 
 
@@ -137,17 +93,18 @@ def _short(error: Json) -> Json:
     }
 
 
-def _inverse_by_action(found: Round, test: SegmentBatch) -> list[float]:
+def _inverse_by_action(found: Round, test: SegmentBatch) -> list[float | None]:
     assert found.models.world_model is not None
     assert test.actions is not None
     right = transition_errors(found.models.world_model, test, found.models.inverse_dynamics).inverse_correct
     assert right is not None
-    return [float(right[test.actions[:, 0] == action].double().mean()) for action in range(ACTIONS)]
+    chosen = [right[test.actions[:, 0] == action].double() for action in range(ACTIONS)]
+    return [float(each.mean()) if len(each) else None for each in chosen]
 
 
 def _ranks(arm: Arm, found: Round, test: SegmentBatch) -> Json:
     """Rank correlation of the arm's score with the true loss, on data of natural frequency."""
-    if arm.strategy in ("random", "no_score", "oracle_uniform", "fidelity"):
+    if arm.strategy in WITHOUT_RANKS:
         return {}
     models, inverse = found.models, found.models.inverse_dynamics
     assert models.world_model is not None
@@ -166,21 +123,19 @@ def _correlations(score: Tensor, loss: Tensor) -> Json:
 
 
 def _picks(found: Round, pool: SegmentBatch) -> Json:
-    """What was picked: segments, how many effective ones of each action, and the quantiles of their true losses."""
+    """What was picked: segments, how many effective ones of each action, and their true losses."""
     if len(found.picks) == 0:
         return {}
     chosen = pool.take(found.picks)
     assert chosen.action_sets is not None
     alone = chosen.action_sets[:, 0].sum(1) == 1
-    by_action = chosen.action_sets[:, 0][alone].sum(0).tolist()
-    losses = pool_losses(found.models, chosen).double()
     return {
         "segments": [[name.trajectory[:12], name.start] for name in chosen.segments],
-        "by_action": by_action,
+        "by_action": chosen.action_sets[:, 0][alone].sum(0).tolist(),
         "no_ops": int((~alone).sum()),
-        "true_loss": [float(losses.quantile(share)) for share in (0.1, 0.25, 0.5, 0.75, 0.9)],
+        "true_losses": [round(loss, 4) for loss in pool_losses(found.models, chosen).tolist()],
     }
 
 
 if __name__ == "__main__":
-    main()
+    finish(main())

@@ -53,7 +53,11 @@ class Round:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One arm from one seed. pool: unlabeled segments with their hidden action sets, in the order of membership."""
+    """One arm from one seed. pool: unlabeled segments with their hidden action sets, in the order of membership.
+
+    seed_set: the first labels, where they are not drawn from the pool. video: what the subgoal generator sees, where
+    that is not the pool.
+    """
 
     arm: Arm
     seed: int
@@ -61,16 +65,21 @@ class Experiment:
     pool: SegmentBatch
     shared: Path | None = None  # folder for the first round's networks
     plan: Plan = Plan()
+    seed_set: SegmentBatch | None = None
+    video: SegmentBatch | None = None
 
     def rounds(self) -> Iterator[Round]:
         """`batches` + 1 rounds; the last one picks nothing."""
         rng = np.random.default_rng(self.seed)  # of the labeling worker
         free = torch.ones(self.pool.size, dtype=torch.bool)
         labeled, previous = list[SegmentBatch](), None
+        if self.seed_set is not None:
+            labeled.append(self.seed_set)
         picks = self._first_picks()
         for number in range(1, self.plan.batches + 2):
             free[picks] = False
-            labeled.append(draw_labels(self.pool.take(picks), rng))
+            if len(picks):
+                labeled.append(draw_labels(self.pool.take(picks), rng))
             everything = concatenate(labeled)
             models = replace(self._trained(number, everything), previous_world_model=previous)
             scores = self._scores(number, models)
@@ -86,7 +95,7 @@ class Experiment:
 
     def _first_picks(self) -> Tensor:
         """Before any model there is only chance, the same for all arms of a seed."""
-        return top(self._uniform(), self.plan.seed_labels)
+        return top(self._uniform(), 0 if self.seed_set is not None else self.plan.seed_labels)
 
     def _uniform(self) -> Tensor:
         generator = scoring_generator(self.seed, "random", 0, self.trajectories, "shard 0")
@@ -105,7 +114,7 @@ class Experiment:
     def _network(self, number: int, kind: str, member: int, labeled: SegmentBatch) -> Network:
         """The subgoal generator and the first round's networks do not depend on the arm: they are kept and shared."""
         if kind == "subgoal_generator":
-            number, labeled = 0, self.pool.without_labels()
+            number, labeled = 0, (self.video or self.pool).without_labels()
         kept = self.shared / f"seed-{self.seed}-{kind}-{member}.safetensors" if self.shared and number < 2 else None
         if kept is not None and kept.exists():
             return checkpoints.load(kept.read_bytes())

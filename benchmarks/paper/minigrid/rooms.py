@@ -1,0 +1,107 @@
+"""Which rooms figure 4d is about: the project's own, or files in the foreign layout in place of parts of them."""
+
+import argparse
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+from torch.nn.functional import one_hot
+
+from benchmarks.paper.minigrid import foreign
+from benchmarks.paper.minigrid.datasets import ACTIONS, REPORTED, TUNING, DataSpec, draw_test_labels, grid_spaces, load
+from models.segments import SegmentBatch
+from models.spaces import Spaces
+
+FILES = {
+    "test_set": "in place of both tests",
+    "pool": "in place of the pool",
+    "seed_set": "the first labels, which are else drawn from the pool",
+    "video": "for the subgoal generator, which else trains on the pool's observations",
+}
+
+
+@dataclass(frozen=True)
+class Data:
+    """pool: with the hidden action sets. tests: by name. seed_set, video: None where they come from the pool."""
+
+    pool: SegmentBatch
+    tests: dict[str, SegmentBatch]
+    seed_set: SegmentBatch | None
+    video: SegmentBatch | None
+
+    @property
+    def spaces(self) -> Spaces:
+        """Of the pool's rooms."""
+        return grid_spaces(int(self.pool.observations["grid"].shape[2]))
+
+
+@dataclass(frozen=True)
+class Rooms:
+    """The reported rooms or those for tuning; `data_seed` chooses among either. Files stand in for parts of them.
+
+    All layouts of a test are of other seeds than the pool's.
+    """
+
+    folder: Path
+    tuning: bool = False
+    data_seed: int = 0
+    pool_transitions: int = 28_000
+    per_action: int = 500
+    natural_transitions: int = 6000
+    test_set: Path | None = None
+    pool: Path | None = None
+    seed_set: Path | None = None
+    video: Path | None = None
+
+    @classmethod
+    def of(cls, asked: argparse.Namespace) -> "Rooms":
+        """From the options that `add_options` and `add_files` add."""
+        files = {name: getattr(asked, name) for name in FILES}
+        return cls(asked.out / "data", asked.tuning, asked.data_seed, **files)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What sets results on these rooms apart from those on others."""
+        files = [path.stem for path in (self.test_set, self.pool, self.seed_set, self.video) if path is not None]
+        return ("tuning" if self.tuning else "reported", *([f"data{self.data_seed}"] if self.data_seed else []), *files)
+
+    def load(self) -> Data:
+        """From files, made where they are not there yet."""
+        return _load(self)
+
+    def spec(self, number: int, behavior: str, transitions: int, per_action: int = 0) -> DataSpec:
+        """Set `number` of these rooms."""
+        first = (TUNING if self.tuning else REPORTED) + 10 * self.data_seed
+        return DataSpec(behavior, transitions, first + number, per_action=per_action)
+
+
+def add_files(parser: argparse.ArgumentParser) -> None:
+    """Options for which rooms, and for files in the foreign layout."""
+    parser.add_argument("--data-seed", type=int, default=0)
+    for name, what in FILES.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=Path, help=f"npz of transitions, {what}")
+
+
+@cache
+def _load(rooms: Rooms) -> Data:
+    """Once a process."""
+    pool = _foreign(rooms.pool) or load(rooms.spec(1, "mixture", rooms.pool_transitions), rooms.folder)
+    return Data(pool, _tests(rooms), _foreign(rooms.seed_set), _foreign(rooms.video))
+
+
+def _tests(rooms: Rooms) -> dict[str, SegmentBatch]:
+    given = _foreign(rooms.test_set)
+    if given is not None:
+        return {"balanced": given, "natural": given}
+    balanced = load(rooms.spec(2, "balanced", 200_000, rooms.per_action), rooms.folder)
+    natural = load(rooms.spec(3, "mixture", rooms.natural_transitions), rooms.folder)
+    return {"balanced": draw_test_labels(balanced), "natural": draw_test_labels(natural)}
+
+
+def _foreign(path: Path | None) -> SegmentBatch | None:
+    """Such a file knows one action of each step; that others explain it too is not known there."""
+    if path is None:
+        return None
+    batch = foreign.read(path)
+    assert batch.actions is not None
+    return replace(batch, action_sets=one_hot(batch.actions, ACTIONS).bool())
