@@ -7,6 +7,7 @@ from api_schemas.base import Schema
 StrategyName = Literal[
     "random",
     "cycle",
+    "confident_cycle",
     "masked_cycle",
     "vanilla_cycle",
     "self_inverse",
@@ -48,6 +49,11 @@ _CYCLE = ("inverse_dynamics", "world_model")
 CATALOG: tuple[Strategy, ...] = (
     _strategy("random", (), "Segments in uniformly random order; needs no model."),
     _strategy("cycle", _CYCLE, "Forward-inverse cycle error under the sparse inverse model (equation 7)."),
+    _strategy(
+        "confident_cycle",
+        _CYCLE,
+        "Cycle error over all actions that the inverse model thinks possible: what it doubts ranks lower.",
+    ),
     _strategy(
         "masked_cycle",
         ("masked_inverse_dynamics", "world_model"),

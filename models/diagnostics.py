@@ -14,8 +14,9 @@ from torch import Tensor
 from models.cycle_consistency import cycle
 from models.inverse_dynamics.base import DiscreteInverseDynamics, VerifyingBlock
 from models.rank_correlation import kendall, spearman
-from models.segments import SegmentBatch, first
+from models.segments import SegmentBatch
 from models.spaces import DiscreteAction
+from models.step_distances import nearest_actions
 from models.support import AfterEach, nearest, whole_observation
 from models.world_models.base import WorldModel
 
@@ -152,22 +153,9 @@ def diagnose(
 def true_loss(world_model: WorldModel, batch: SegmentBatch, sets: Tensor) -> Tensor:
     """The world model's distance under the true actions, of those in `sets` (B, L, n) the ones it is best at: (B,).
 
-    All actions in the set of a step are true, so the world model errs by its smallest distance over them. Of longer
-    segments each step's action is chosen before the next is predicted, which for L = 1 is the minimum itself.
+    All actions in the set of a step are true, so the world model errs by its smallest distance over them.
     """
-    state, total = world_model.infer_state(first(batch.observations)), torch.zeros(batch.size, device=sets.device)
-    for step in range(batch.length):
-        rows, actions = sets[:, step].nonzero(as_tuple=True)  # every pair of a segment and an action of its set, (P,)
-        prediction = world_model.rollout(state[rows], actions.unsqueeze(1))  # (P, 1, ...)
-        after = {name: stream[rows, step + 1].unsqueeze(1) for name, stream in batch.observations.items()}
-        distance = world_model.distance(prediction, after)
-        table = distance.new_full(sets[:, step].shape, torch.inf)
-        table[rows, actions] = distance
-        best, action = table.min(1)
-        places = (sets[:, step].flatten().cumsum(0) - 1).view_as(sets[:, step])
-        state = prediction[places.gather(1, action.unsqueeze(1)).squeeze(1), 0]
-        total = total + best
-    return total
+    return nearest_actions(world_model, batch.observations, sets)[1]
 
 
 def explanations(inverse_dynamics: DiscreteInverseDynamics, batch: SegmentBatch) -> Tensor:

@@ -152,7 +152,9 @@ class GridFamily:
             case "inverse_dynamics":
                 return TrainingConfig(steps=400, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
             case "dense_inverse_dynamics":
-                return TrainingConfig(steps=400, batch_size=64, learning_rate=3e-3, weight_decay=1e-3)
+                # It sees whole frames: with the sparse form's 400 steps it is still far from what it can learn.
+                steps = min(1600, max(800, 3 * segments))
+                return TrainingConfig(steps=steps, batch_size=64, learning_rate=3e-3, weight_decay=1e-3)
             case "masked_inverse_dynamics":
                 return TrainingConfig(steps=800, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
             case "subgoal_generator":

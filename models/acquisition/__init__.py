@@ -2,6 +2,7 @@
 
 from models.acquisition.base import Models, NonFiniteScoreError, Strategy, score_pool
 from models.acquisition.batch_rules import BATCH_RULES, BatchRule, Candidates, describe, top
+from models.acquisition.confident_cycle import ConfidentCycle
 from models.acquisition.cycle import Cycle
 from models.acquisition.fidelity import Fidelity
 from models.acquisition.forward_cycle import ForwardCycle
@@ -32,6 +33,7 @@ __all__ = [
 _ALL: tuple[Strategy, ...] = (
     Random(),
     Cycle(),
+    ConfidentCycle(),
     MaskedCycle(),
     VanillaCycle(),
     SelfInverse(),

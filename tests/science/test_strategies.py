@@ -1,5 +1,6 @@
 """What holds for every strategy in the registry."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -8,10 +9,11 @@ from torch import Tensor
 
 from models.acquisition import STRATEGIES, Models, NonFiniteScoreError, Strategy, score_pool
 from models.acquisition.base import FIRST_ROUND_LACKS
+from models.acquisition.confident_cycle import ConfidentCycle
 from models.families import GRID
 from models.inverse_dynamics.base import DiscreteInverseDynamics
 from models.network import KINDS
-from models.segments import SegmentBatch
+from models.segments import Observations, SegmentBatch
 from models.world_models.grid import GridWorldModel
 from tests.science import toy_grid
 
@@ -170,3 +172,41 @@ def test_scoring_stops_between_two_chunks(pool: SegmentBatch) -> None:
     with pytest.raises(InterruptedError):
         score_pool(STRATEGIES["random"], Models(), pool, torch.Generator(), chunk=10, after_each=stop)
     assert len(told) == 2
+
+
+class Doubting:
+    """Inverse dynamics that cannot decide between the action that another finds likeliest and the next in number."""
+
+    def __init__(self, sure: DiscreteInverseDynamics) -> None:
+        self._sure = sure
+
+    def log_prob(self, batch: SegmentBatch) -> Tensor:
+        best = self._sure.infer(batch.observations)
+        log_prob = torch.full((*best.shape, toy_grid.ACTIONS), -torch.inf)
+        log_prob.scatter_(2, ((best + 1) % toy_grid.ACTIONS).unsqueeze(2), math.log(0.5) + 1e-3)
+        return log_prob.scatter_(2, best.unsqueeze(2), math.log(0.5))
+
+    def infer(self, observations: Observations) -> Tensor:
+        return self.log_prob(SegmentBatch(observations)).argmax(-1)
+
+
+def test_a_doubted_action_is_no_reason_to_ask(models: Models, movement_only: SegmentBatch) -> None:
+    """The world model knows movement. Under a wrong action that is only just preferred the cycle error is large."""
+    moves = movement_only.take(slice(0, 100))
+    sure = models.inverse_dynamics
+    assert sure is not None
+    doubting = replace(models, inverse_dynamics=Doubting(sure))  # type: ignore[arg-type]  # no more is asked of it
+    plain, confident = (_score(STRATEGIES[name], doubting, moves) for name in ("cycle", "confident_cycle"))
+    true_actions = _score(STRATEGIES["cycle"], models, moves)
+    assert bool((confident <= true_actions + 1e-4).all())
+    assert float(plain.median()) > 5 * float(confident.median())
+
+
+def test_a_sure_inverse_leaves_the_cycle_error_as_it_is(models: Models, pool: SegmentBatch) -> None:
+    sure = models.inverse_dynamics
+    assert sure is not None
+    others = sure.log_prob(pool)[:, 0].sort(1).values[:, -2]  # the second likeliest
+    certain = others < math.log(ConfidentCycle.least)
+    assert int(certain.sum()) > 20
+    plain, confident = (_score(STRATEGIES[name], models, pool) for name in ("cycle", "confident_cycle"))
+    torch.testing.assert_close(confident[certain], plain[certain])

@@ -57,7 +57,7 @@ class DataSpec:
         return grid_spaces(self.room_size)
 
     @property
-    def options(self) -> dict[str, object]:
+    def options(self) -> dict[str, str | int | float | bool]:
         """Of the simulator."""
         return {"room_size": self.room_size, "objects": self.objects, "noisy_tiles": self.noisy_tiles}
 
