@@ -99,8 +99,8 @@ class AccuracyRun:
         return composition.test_set(self._first() + TESTING, self.per_action, self.folder)
 
 
-def main() -> None:
-    """Run what is missing, print the table, draw the chart, hold the figures against their targets."""
+def main(argv: Sequence[str] | None = None) -> list[Figure]:
+    """Run what is missing, print the table, draw the chart; the figures with their targets."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_options(parser, "4a")
     parser.add_argument("--seeds", type=int, default=5)
@@ -108,7 +108,7 @@ def main() -> None:
     parser.add_argument("--draws", nargs="+", choices=("balanced", "uniform"), default=["balanced", "uniform"])
     parser.add_argument("--test-set", type=Path, help="npz in the foreign layout (foreign.py) in place of our test")
     parser.add_argument("--seed-set", type=Path, help="npz in the foreign layout in place of our labels")
-    asked = parser.parse_args()
+    asked = parser.parse_args(argv)
     runs = [
         AccuracyRun(
             form, draw, labels, seed, asked.out / "data", asked.tuning, test_set=asked.test_set, seed_set=asked.seed_set
@@ -119,7 +119,7 @@ def main() -> None:
     found = results(runs, asked.out)
     print_table(found)
     draw_chart(found, asked.out / "4a.png")
-    finish(figures(found, max(asked.labels)))
+    return figures(found, max(asked.labels))
 
 
 def print_table(found: Sequence[Json]) -> None:
@@ -167,4 +167,4 @@ def figures(found: Sequence[Json], labels: int) -> list[Figure]:
 
 
 if __name__ == "__main__":
-    main()
+    finish(main())

@@ -1,0 +1,98 @@
+"""Every figure of MiniGrid, one after another, with all targets at the end.
+
+    python -m benchmarks.paper.minigrid             all arms under top-n and the default rule, at most 90 minutes
+    python -m benchmarks.paper.minigrid --quick     4a and 4d with four arms, 3 seeds, 10 minutes
+    python -m benchmarks.paper.minigrid --full      every arm under every batch rule
+
+Finished runs are not repeated: a benchmark that was stopped goes on where it was. Status 1 where a target is missed.
+"""
+
+import argparse
+import multiprocessing
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Literal
+
+from benchmarks.figures import Figure, finish
+
+Extent = Literal["quick", "usual", "full"]
+FEW = ("random:top", "oracle:top", "cycle:kmeans_plus_plus", "uncertainty:kmeans_plus_plus")
+MANY_SEEDS = (*FEW, "self_inverse:kmeans_plus_plus")  # the arms with 10 seeds
+
+
+@dataclass(frozen=True)
+class Part:
+    """One figure's module, the folder of its results, and its options."""
+
+    module: str
+    folder: str
+    options: tuple[str, ...] = ()
+
+    def main(self, shared: Sequence[str], out: Path) -> list[Figure]:
+        """Run it. The module, with torch, is imported now."""
+        module = import_module(f"benchmarks.paper.minigrid.{self.module}")
+        figures: list[Figure] = module.main([*shared, "--out", str(out / self.folder), *self.options])
+        return figures
+
+
+def parts(extent: Extent, out: Path) -> list[Part]:
+    """What runs, in order: what is quick first, 4d last but for the figure that only reads its results."""
+    if extent == "quick":
+        return [
+            Part("inverse_accuracy", "4a", ("--seeds", "3")),
+            Part("acquisition", "4d", ("--seeds", "3", "--arms", *FEW)),
+        ]
+    return [
+        Part("inverse_accuracy", "4a"),
+        Part("prediction", "prediction", () if extent == "full" else ("--draws", "balanced")),
+        Part("predictions", "9"),
+        Part("acquisition", "4d", ("--seeds", "10", "--arms", *MANY_SEEDS)),
+        Part("acquisition", "4d", ("--seeds", "5", "--arms", *_arms(extent))),
+        Part("picked_losses", "8", ("--results", str(out / "4d"))),
+    ]
+
+
+def run(chosen: Sequence[Part], shared: Sequence[str], out: Path) -> list[Figure]:
+    """One after another; a missed target stops none."""
+    told = dict[str, Figure]()
+    for part in chosen:
+        began = time.monotonic()
+        print(f"{part.module}: begins", flush=True)
+        figures = part.main(shared, out)
+        told |= {figure.name: figure for figure in figures}  # a figure that is told twice counts by its last value
+        missed = sum(not figure.met for figure in figures)
+        print(f"{part.module}: {time.monotonic() - began:.0f} s, {missed} targets missed", flush=True)
+    return list(told.values())
+
+
+def main(argv: Sequence[str] | None = None) -> list[Figure]:
+    """All figures of the extent that was asked for."""
+    parser = argparse.ArgumentParser(prog="benchmarks.paper.minigrid", description=(__doc__ or "").partition("\n")[0])
+    extent = parser.add_mutually_exclusive_group()
+    extent.add_argument("--quick", dest="extent", action="store_const", const="quick", help="4a and 4d, four arms")
+    extent.add_argument("--full", dest="extent", action="store_const", const="full", help="all arms and batch rules")
+    parser.add_argument("--out", type=Path, default=Path("results/paper/minigrid"))
+    parser.add_argument("--processes", type=int, default=multiprocessing.cpu_count())
+    parser.add_argument("--threads", type=int, default=1, help="of torch, in each process")
+    parser.add_argument("--tuning", action="store_true", help="rooms that no table reports")
+    asked = parser.parse_args(argv)
+    shared = ["--processes", str(asked.processes), "--threads", str(asked.threads)]
+    shared += ["--tuning"] if asked.tuning else []
+    return run(parts(asked.extent or "usual", asked.out), shared, asked.out)
+
+
+def _arms(extent: Extent) -> list[str]:
+    """Every strategy under top-n and k-means++, or under every batch rule. What draws at random has no rule."""
+    from benchmarks.paper.minigrid.arms import ALL
+    from models.acquisition import BATCH_RULES
+
+    rules = list(BATCH_RULES) if extent == "full" else ["top", "kmeans_plus_plus"]
+    scored = [f"{name}:{rule}" for name in sorted(ALL) if name != "random" for rule in rules]
+    return ["random:top", *scored]
+
+
+if __name__ == "__main__":
+    finish(main())

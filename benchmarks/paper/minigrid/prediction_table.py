@@ -1,0 +1,104 @@
+"""Tables, charts and targets of figures 4b, 4c and noise."""
+
+from collections.abc import Iterator, Sequence
+from itertools import product
+from pathlib import Path
+
+from benchmarks.figures import Figure
+from benchmarks.paper import charts
+from benchmarks.paper.minigrid.prediction import FORMS, FRESH, POINTS, Name, Point
+from benchmarks.paper.minigrid.prediction_data import DRAWS, Draw
+from benchmarks.paper.runs import Json
+from benchmarks.paper.statistics import Estimate, estimate
+
+AXES: dict[Name, str] = {"4b": "labels", "4c": "objects", "noise": "noisy tiles"}
+COUNTED: dict[Name, tuple[str, ...]] = {"4b": ("all",), "4c": ("all",), "noise": ("masked", "all")}
+GROUPS = ("overall", "movement", "interaction")
+PREDICTORS = ("world_model", *FORMS, *(form + FRESH for form in FORMS))
+TARGET = 0.97
+WITHOUT_SIMULATOR = (
+    "The simulator cannot be restored from observations alone, so no inferred action is executed: "
+    "beside the world model stands the share of actions inferred right."
+)
+
+
+def print_tables(figures: Sequence[Name], found: Sequence[Json]) -> None:
+    """Dynamics Accuracy, with its 95 % interval over seeds, at each point, and the share of actions inferred right."""
+    for figure, counted in [(name, counted) for name in figures for counted in COUNTED[name]]:
+        print(f"figure {figure}, Dynamics Accuracy of {'all elements' if counted == 'all' else 'all but noisy tiles'}")
+        print(" | ".join((AXES[figure], "draw", "seeds", "predictor", *GROUPS, "actions inferred")))
+        for point, draw in product(POINTS[figure], DRAWS):
+            tests = tests_at(found, point, draw)
+            for predictor in (name for name in PREDICTORS if tests and name in tests[0][counted]):
+                cells = [str(_estimate(tests, counted, predictor, group)) for group in GROUPS]
+                inferred = [each["inferred"][predictor]["overall"] for each in tests if predictor in FORMS]
+                cells.append(str(estimate(inferred)) if inferred else "")
+                print(" | ".join((str(point.x), draw, str(len(tests)), predictor, *cells)))
+
+
+def print_file_table(found: Sequence[Json], file: str) -> None:
+    """The world model and the actions inferred, on a file's transitions."""
+    print(WITHOUT_SIMULATOR)
+    print(" | ".join(("trained in", "draw", "labels", "seeds", "what", *GROUPS)))
+    settings = dict.fromkeys((each["trained"], each["draw"], each["labels"]) for each in found)
+    for trained, draw, labels in settings:
+        same = [each for each in found if (each["trained"], each["draw"], each["labels"]) == (trained, draw, labels)]
+        tests = [each["tests"][file] for each in same]
+        rows = {"world_model": [test["all"]["world_model"] for test in tests]}
+        rows |= {f"actions, {form}": [test["inferred"][form] for test in tests] for form in FORMS}
+        for name, values in rows.items():
+            cells = [_cell([each.get(group) for each in values]) for group in GROUPS]
+            print(" | ".join((trained, draw, str(labels), str(len(tests)), name, *cells)))
+
+
+def draw_charts(figures: Sequence[Name], found: Sequence[Json], out: Path) -> None:
+    """A chart of each figure, overall and of interactions."""
+    for figure, counted, group in _charts(figures):
+        lines = dict[str, list[tuple[float, Estimate]]]()
+        for predictor, draw, point in product(PREDICTORS, DRAWS, POINTS[figure]):
+            tests = tests_at(found, point, draw)
+            if tests and predictor in tests[0][counted]:
+                value = _estimate(tests, counted, predictor, group)
+                lines.setdefault(f"{predictor}, {draw}", []).append((point.x, value))
+        if lines:
+            file = "-".join((figure, *(["masked"] if counted == "masked" else []), group))
+            charts.curves(lines, AXES[figure], f"Dynamics Accuracy, {group}", out / f"{file}.png")
+
+
+def figures_of(figures: Sequence[Name], found: Sequence[Json]) -> list[Figure]:
+    """At each point the better form and draw of inverse dynamics, with its target, and the better world model."""
+    told = []
+    for figure, point in [(name, point) for name in figures for point in POINTS[name]]:
+        counted = COUNTED[figure][0]
+        by_draw = [tests for draw in DRAWS if (tests := tests_at(found, point, draw))]
+        means = {
+            name: max(_estimate(tests, counted, name, "overall").mean for tests in by_draw)
+            for name in ("world_model", *FORMS)
+        }
+        told.append(Figure(f"{figure}_inverse_{point.x}", max(means[form] for form in FORMS), "share", TARGET))
+        told.append(Figure(f"{figure}_world_model_{point.x}", means["world_model"], "share"))
+    return told
+
+
+def tests_at(found: Sequence[Json], point: Point, draw: Draw) -> list[Json]:
+    """One a seed."""
+    return [
+        each["tests"][point.tested.name]
+        for each in found
+        if (each["draw"], each["labels"], each["trained"]) == (draw, point.labels, point.trained.name)
+        and point.tested.name in each["tests"]
+    ]
+
+
+def _charts(figures: Sequence[Name]) -> Iterator[tuple[Name, str, str]]:
+    for figure in figures:
+        yield from product([figure], COUNTED[figure], ("overall", "interaction"))
+
+
+def _estimate(tests: Sequence[Json], counted: str, predictor: str, group: str) -> Estimate:
+    return estimate([test[counted][predictor][group] for test in tests])
+
+
+def _cell(values: Sequence[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return str(estimate(known)) if known else ""
