@@ -6,11 +6,12 @@ export PYTHONSAFEPATH := 1
 SEED ?= 0
 REPEAT ?= 50
 
-.PHONY: help setup system demo serve test test-slow lint types imports format bench-acquire bench-score clean
+.PHONY: help setup system demo serve test test-slow lint types imports format bench-acquire bench-score bench-paper-minigrid \
+	bench-paper-minigrid-full clean
 .DEFAULT_GOAL := help
 
 help: ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-26s %s\n", $$1, $$2}'
 
 setup: $(VENV)/.installed ## .venv with everything that demo and test need
 
@@ -57,6 +58,12 @@ bench-acquire: setup ## latency of POST /acquire with a ready queue
 
 bench-score: setup ## the scoring job beside the networks' bare forward pass
 	$(BIN)/python -m benchmarks.service.score
+
+bench-paper-minigrid: setup ## the paper's MiniGrid figures, at most 90 minutes on 2 cores, resumable (QUICK=1: 4a and 4d, 10 minutes)
+	$(BIN)/python -m benchmarks.paper.minigrid $(if $(QUICK),--quick)
+
+bench-paper-minigrid-full: setup ## the same with every strategy under every batch rule: hours, resumable
+	$(BIN)/python -m benchmarks.paper.minigrid --full
 
 clean: ## remove .venv and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache *.egg-info

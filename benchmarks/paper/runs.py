@@ -45,10 +45,13 @@ def run_missing(runs: Sequence[Run], out: Path, processes: int, threads: int) ->
     began = time.monotonic()
     with ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(threads,)) as pool:
         futures = [pool.submit(_done, run, out) for run in missing]
-        for done, future in enumerate(as_completed(futures), 1):
-            name, seconds = future.result()
-            total = time.monotonic() - began
-            print(f"{done} of {len(missing)}, {total:.0f} s: {name} took {seconds:.0f} s", flush=True)
+        try:
+            for done, future in enumerate(as_completed(futures), 1):
+                name, seconds = future.result()
+                total = time.monotonic() - began
+                print(f"{done} of {len(missing)}, {total:.0f} s: {name} took {seconds:.0f} s", flush=True)
+        finally:
+            pool.shutdown(cancel_futures=True)  # a run has failed: what it tells need not wait for all others
 
 
 def results(runs: Sequence[Run], out: Path) -> list[Json]:

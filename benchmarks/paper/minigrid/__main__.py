@@ -62,7 +62,8 @@ def run(chosen: Sequence[Part], shared: Sequence[str], out: Path) -> list[Figure
         began = time.monotonic()
         print(f"{part.module}: begins", flush=True)
         figures = part.main(shared, out)
-        told |= {figure.name: figure for figure in figures}  # a figure that is told twice counts by its last value
+        for figure in figures:
+            told.setdefault(figure.name, figure)  # told twice it counts by the first part, the one with more seeds
         missed = sum(not figure.met for figure in figures)
         print(f"{part.module}: {time.monotonic() - began:.0f} s, {missed} targets missed", flush=True)
     return list(told.values())

@@ -18,29 +18,19 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from benchmarks.figures import Figure, finish
 from benchmarks.paper.minigrid import foreign
-from benchmarks.paper.minigrid.changes import accuracy, changes, without_tiles
 from benchmarks.paper.minigrid.datasets import REPORTED, TUNING, grid_spaces
+from benchmarks.paper.minigrid.prediction_accuracy import with_simulator, without_simulator
 from benchmarks.paper.minigrid.prediction_data import DRAWS, Draw, Room
 from benchmarks.paper.runs import Json, add_options, results, run_missing
 from models.chance import training_generator
 from models.families import GRID
-from models.inverse_dynamics.base import DiscreteInverseDynamics
 from models.network import Network
-from models.segments import Observations, SegmentBatch, first
+from models.segments import SegmentBatch
 from models.training import train
-from models.world_models.base import WorldModel
-from workers.simulators.base import Simulator, State
-from workers.simulators.minigrid_rules import INTERACTION
 
 FORMS = {"sparse": "inverse_dynamics", "dense": "dense_inverse_dynamics"}
-FRESH = " fresh"  # ends the name of a form whose simulator lost its chance
-CHUNK = 512
 Name = Literal["4b", "4c", "noise"]
 
 
@@ -89,8 +79,12 @@ class PredictionRun:
         inverses: dict[str, Any] = {form: self._network(kind, labeled) for form, kind in FORMS.items()}
         told: Json = {"draw": self.draw, "labels": self.labels, "seed": self.seed, "trained": self.trained.name}
         if self.test_set is not None:
-            return told | {"tests": {self.test_set.stem: _on_file(world_model, inverses, foreign.read(self.test_set))}}
-        return told | {"tests": {room.name: self._tested(world_model, inverses, room) for room in self.tested}}
+            file = foreign.read(self.test_set)
+            return told | {"tests": {self.test_set.stem: without_simulator(world_model, inverses, file)}}
+        tests = {room: room.test(self.per_action, self._first(), self.folder) for room in self.tested}
+        return told | {
+            "tests": {room.name: with_simulator(world_model, inverses, room, *test) for room, test in tests.items()}
+        }
 
     def _first(self) -> int:
         return TUNING if self.tuning else REPORTED
@@ -100,74 +94,6 @@ class PredictionRun:
         network = GRID.build(kind, grid_spaces(self.trained.size), {}, generator)
         train(network, labeled, GRID.training_config(kind, labeled.size), generator)
         return network
-
-    def _tested(self, world_model: WorldModel, inverses: dict[str, DiscreteInverseDynamics], room: Room) -> Json:
-        test, states = room.test(self.per_action, self._first(), self.folder)
-        told, guesses = _on_file(world_model, inverses, test), dict[str, Observations]()
-        for form, inverse in inverses.items():
-            inferred = _inferred(inverse, test)
-            guesses[form] = executed(room.simulator(), states, inferred)
-            if room.noisy_tiles:
-                guesses[form + FRESH] = executed(room.simulator(), _chance_exchanged(states), inferred)
-        for form, guess in guesses.items():
-            told["all"][form] = accuracy(*changes(guess, test.observations), _groups(test))
-        guesses["world_model"] = predicted(world_model, test)
-        still = without_tiles(torch.from_numpy(np.stack([state["cells"] for state in states])))
-        told["masked"] = {
-            name: accuracy(*changes(guess, test.observations, still), _groups(test)) for name, guess in guesses.items()
-        }
-        return told
-
-
-def _on_file(world_model: WorldModel, inverses: dict[str, DiscreteInverseDynamics], test: SegmentBatch) -> Json:
-    """What needs no simulator."""
-    assert test.actions is not None
-    right = {form: (_inferred(inverse, test) == test.actions[:, 0]).double() for form, inverse in inverses.items()}
-    return {
-        "all": {"world_model": accuracy(*changes(predicted(world_model, test), test.observations), _groups(test))},
-        "inferred": {
-            form: {group: float(each[members].mean()) for group, members in _groups(test).items() if members.any()}
-            for form, each in right.items()
-        },
-    }
-
-
-@torch.inference_mode()
-def predicted(world_model: WorldModel, test: SegmentBatch) -> Observations:
-    """The likeliest next observations (B, ...) under the true actions."""
-    parts = []
-    for start in range(0, test.size, CHUNK):
-        part = test.take(slice(start, start + CHUNK))
-        assert part.actions is not None
-        state = world_model.infer_state(first(part.observations))
-        parts.append(world_model.observe(world_model.predict(state, part.actions[:, 0])))
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def executed(simulator: Simulator, states: Sequence[State], actions: Tensor) -> Observations:
-    """What the simulator shows after each action (B,) in each state: (B, ...)."""
-    reached = []
-    for state, action in zip(states, actions.tolist(), strict=True):
-        simulator.restore(state)
-        reached.append(simulator.step(action).observation)
-    return {name: torch.from_numpy(np.stack([each[name] for each in reached])) for name in reached[0]}
-
-
-def _chance_exchanged(states: Sequence[State]) -> list[State]:
-    """Each state with the generator of the next one."""
-    others = [*states[1:], states[0]]
-    return [{**state, "generator": other["generator"]} for state, other in zip(states, others, strict=True)]
-
-
-@torch.inference_mode()
-def _inferred(inverse_dynamics: DiscreteInverseDynamics, test: SegmentBatch) -> Tensor:
-    return inverse_dynamics.infer(test.observations)[:, 0]
-
-
-def _groups(test: SegmentBatch) -> dict[str, Tensor]:
-    assert test.actions is not None
-    interacts = torch.isin(test.actions[:, 0], torch.tensor(INTERACTION))
-    return {"overall": torch.ones_like(interacts), "movement": ~interacts, "interaction": interacts}
 
 
 def runs_of(

@@ -9,6 +9,7 @@ import torch
 
 from benchmarks.paper.minigrid.datasets import (
     ACTIONS,
+    TUNING,
     DataSpec,
     draw_labels,
     draw_test_labels,
@@ -42,7 +43,7 @@ class Room:
 
     def simulator(self) -> Simulator:
         """That draws such rooms."""
-        return make_simulator("minigrid", self._data("balanced", 1, 0).options)
+        return make_simulator("minigrid", self._data("balanced", 1, TUNING).options)
 
     def labeled(self, draw: Draw, labels: int, seed: int, first: int, folder: Path) -> SegmentBatch:
         """`labels` transitions of a pool that all seeds share; with one seed a smaller set is part of a larger one.

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from benchmarks.figures import Figure
 from benchmarks.paper import charts
-from benchmarks.paper.minigrid.prediction import FORMS, FRESH, POINTS, Name, Point
+from benchmarks.paper.minigrid.prediction import FORMS, POINTS, Name, Point
+from benchmarks.paper.minigrid.prediction_accuracy import FRESH
 from benchmarks.paper.minigrid.prediction_data import DRAWS, Draw
 from benchmarks.paper.runs import Json
 from benchmarks.paper.statistics import Estimate, estimate

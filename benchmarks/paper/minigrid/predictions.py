@@ -22,7 +22,7 @@ from benchmarks.paper.minigrid.changes import changes
 from benchmarks.paper.minigrid.datasets import ACTIONS, REPORTED, TUNING, DataSpec, draw_test_labels, load
 from benchmarks.paper.minigrid.drawing import draw_observation
 from benchmarks.paper.minigrid.loop import Experiment
-from benchmarks.paper.minigrid.prediction import predicted
+from benchmarks.paper.minigrid.prediction_accuracy import predicted
 from benchmarks.paper.runs import Json, add_options, results, run_missing
 from models.segments import Observations, SegmentBatch, at
 from workers.simulators.minigrid_rules import ACTION_NAMES
