@@ -44,7 +44,7 @@ def finished(folder: Path, tuning: bool) -> list[Json]:
     """Results of figure 4d in its own rooms, reported or for tuning, by name; none of others' files."""
     told = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
     rooms = "tuning" if tuning else "reported"
-    return [each for each in told if "arm" in each and each["name"].endswith(f"-{each['seed']}-{rooms}")]
+    return [each for each in told if "arm" in each and each.get("name", "").endswith(f"-{each['seed']}-{rooms}")]
 
 
 def losses(results: Sequence[Json]) -> Losses:
