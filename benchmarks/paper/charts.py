@@ -37,9 +37,10 @@ def curves(groups: Mapping[str, Sequence[tuple[float, Estimate]]], across: str, 
 def boxes(groups: Mapping[str, Sequence[float]], label: str, path: Path) -> None:
     """A box a key of `groups` around its values: quartiles, whiskers to the 5th and 95th percentile."""
     figure, axes = _empty(label)
+    figure.set_size_inches(max(SIZE[0], 0.5 * len(groups)), SIZE[1])
     axes.boxplot(list(groups.values()), tick_labels=list(groups), whis=(5, 95), showfliers=False)
     axes.set_yscale("symlog")
-    axes.tick_params(axis="x", rotation=30)
+    axes.tick_params(axis="x", rotation=90 if len(groups) > 8 else 15, labelsize="small")
     figure.savefig(path)
 
 

@@ -1,7 +1,8 @@
 """World model against the simulator under inferred actions: what a known inference must lead to."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -10,15 +11,16 @@ from torch import Tensor
 
 from benchmarks.paper.minigrid import foreign, prediction_data
 from benchmarks.paper.minigrid.datasets import ACTIONS, TUNING, grid_spaces
-from benchmarks.paper.minigrid.prediction import POINTS, runs_of
+from benchmarks.paper.minigrid.prediction import POINTS, Point, main, runs_of
 from benchmarks.paper.minigrid.prediction_accuracy import FRESH, with_simulator, without_simulator
 from benchmarks.paper.minigrid.prediction_data import Room, labels_of_each
 from benchmarks.paper.minigrid.prediction_table import figures_of, print_file_table
-from benchmarks.paper.runs import Json
-from models.families import GRID
+from benchmarks.paper.runs import Json, result_file
+from models.families import GRID, GridFamily
 from models.segments import Observations, SegmentBatch
 from models.training import TrainingConfig, train
 from models.world_models.base import WorldModel
+from tests.benchmarks.transitions import transitions
 from workers.simulators.base import State
 from workers.simulators.minigrid import LEFT
 
@@ -111,6 +113,46 @@ def test_a_file_of_the_same_steps_gives_the_same_numbers(
     ours = without_simulator(world_model, inverses, test)
     assert without_simulator(world_model, inverses, foreign.read(tmp_path / "file.npz")) == ours
     assert 0.0 < ours["inferred"]["sparse"]["overall"] < 1.0
+
+
+@pytest.fixture
+def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, _small_pool: None) -> Callable[[Path | None], list[str]]:
+    """Options of a 4b of one point, whose run is finished: barely trained, in this process."""
+    monkeypatch.setitem(POINTS, "4b", [Point(70, 70, Room(), Room())])
+    monkeypatch.setattr(GridFamily, "training_config", lambda *_: TrainingConfig(20, 32, 1e-2, 0.5))
+
+    def finish(test_set: Path | None) -> list[str]:
+        (run,) = runs_of(("4b",), ("balanced",), 1, tmp_path / "data", True, test_set)
+        result_file(tmp_path, run).write_text(json.dumps({"name": run.name, **replace(run, per_action=10).results()}))
+        options = ["--figures", "4b", "--draws", "balanced", "--seeds", "1", "--tuning", "--out", str(tmp_path)]
+        return options if test_set is None else [*options, "--test-set", str(test_set)]
+
+    return finish
+
+
+def test_the_figure_is_printed_drawn_and_held_against_its_target(
+    done: Callable[[Path | None], list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    inverse, world_model = main(done(None))
+    assert (inverse.name, inverse.target) == ("4b_inverse_70", 0.97)
+    assert (world_model.name, world_model.target) == ("4b_world_model_70", None)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(" | ")[:4] for line in lines[2:]] == [
+        ["70", "balanced", "1", predictor] for predictor in ("world_model", "sparse", "dense")
+    ]
+    assert {path.name for path in tmp_path.glob("*.png")} == {"4b-overall.png", "4b-interaction.png"}
+
+
+def test_a_files_rooms_take_the_place_of_the_test(
+    done: Callable[[Path | None], list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    foreign.write(transitions("random", 60, TUNING + 800_000), tmp_path / "theirs.npz")
+    assert main(done(tmp_path / "theirs.npz")) == []
+    lines = capsys.readouterr().out.splitlines()
+    assert "no inferred action is executed" in lines[0]
+    assert [line.split(" | ")[:5] for line in lines[2:]] == [
+        ["6-3-0", "balanced", "70", "1", what] for what in ("world_model", "actions, sparse", "actions, dense")
+    ]
 
 
 @pytest.mark.usefixtures("_small_pool")
