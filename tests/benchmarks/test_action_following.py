@@ -1,12 +1,20 @@
 """Action-following score: world models whose score is known, and the outcomes that it is held against."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.paper.minigrid.action_following import Outcomes, action_following, outcomes, spread
+from benchmarks.paper.minigrid.action_following import (
+    Outcomes,
+    action_following,
+    load_outcomes,
+    outcomes,
+    spread,
+)
+from benchmarks.paper.minigrid.datasets import TUNING, DataSpec, load
 from models.segments import Observations
 from workers.simulators.base import State
 from workers.simulators.catalog import make_simulator
@@ -80,6 +88,14 @@ def test_outcomes_are_what_the_simulator_does_from_the_same_state() -> None:
     assert found.now["grid"].shape == (2, 6, 6, 3)
     assert found.after["carried"][1].tolist() == [[KEY, RED, 0], list(STAND), list(STAND)]  # swap needs a full hand
     assert found.after["grid"][0, :, 2, 3].tolist() == [list(STAND), [KEY, 2, 0], [KEY, RED, 0]]
+
+
+def test_outcomes_of_a_set_begin_where_its_transitions_do(tmp_path: Path) -> None:
+    spec = DataSpec("balanced", 5000, TUNING + 900_000, per_action=3)
+    found = load_outcomes(spec, tmp_path, 7)
+    assert found.after["grid"].shape == (7, 3, 6, 6, 3)
+    grids = {grid.numpy().tobytes() for grid in load(spec, tmp_path).observations["grid"][:, 0]}
+    assert {grid.numpy().tobytes() for grid in found.now["grid"]} <= grids
 
 
 def test_states_are_spread_evenly() -> None:

@@ -14,16 +14,19 @@ that of the true outcomes; on channels that are right, predictions differ exactl
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.paper.minigrid.datasets import DataSpec, load_states
 from models.segments import Observations
 from models.world_models.base import WorldModel
 from workers.simulators.base import Observation, Simulator, State
+from workers.simulators.catalog import make_simulator
 from workers.simulators.minigrid_rules import PICKUP, SWAP, TOGGLE
 
 ACTIONS = (PICKUP, TOGGLE, SWAP)
@@ -56,6 +59,12 @@ def outcomes(simulator: Simulator, states: Sequence[State], actions: tuple[int, 
     )
 
 
+def load_outcomes(spec: DataSpec, folder: Path, count: int = STATES) -> Outcomes:
+    """In `count` states of a set, evenly spaced; the set is made with its states where it is not there yet."""
+    simulator = make_simulator("minigrid", spec.options)
+    return outcomes(simulator, spread(load_states(replace(spec, states=True), folder), count))
+
+
 @torch.inference_mode()
 def action_following(world_model: WorldModel, test: Outcomes) -> float:
     """The score, 0 to 1. Raises ValueError where the actions make no difference in any state."""
@@ -75,7 +84,7 @@ def action_following(world_model: WorldModel, test: Outcomes) -> float:
     return followed / differing
 
 
-def spread(states: Sequence[State], count: int = STATES) -> list[State]:
+def spread(states: Sequence[State], count: int) -> list[State]:
     """`count` of the states, evenly spaced; all where there are fewer."""
     places = np.unique(np.linspace(0, len(states) - 1, min(count, len(states))).round().astype(int))
     return [states[place] for place in places]

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from benchmarks.figures import Figure, finish
 from benchmarks.paper.minigrid.arms import Arm
 from benchmarks.paper.minigrid.changes import changes
-from benchmarks.paper.minigrid.datasets import ACTIONS, REPORTED, TUNING, DataSpec, draw_test_labels, load
+from benchmarks.paper.minigrid.datasets import ACTIONS
 from benchmarks.paper.minigrid.drawing import draw_observation
 from benchmarks.paper.minigrid.loop import Experiment
 from benchmarks.paper.minigrid.prediction_accuracy import predicted
+from benchmarks.paper.minigrid.rooms import Rooms, add_files
 from benchmarks.paper.runs import Json, add_options, results, run_missing
 from models.segments import Observations, SegmentBatch, at
 from workers.simulators.minigrid_rules import ACTION_NAMES
@@ -37,24 +38,25 @@ class PredictionsRun:
     arm: Arm
     seed: int
     examples: int
-    folder: Path
-    tuning: bool = False
-    pool_transitions: int = 28_000
+    rooms: Rooms
+    networks: Path
 
     @property
     def name(self) -> str:
         """Of its file."""
-        rooms = "tuning" if self.tuning else "reported"
-        return f"{self.arm.strategy}-{self.arm.rule}-{self.seed}-{self.examples}-{rooms}"
+        return "-".join((self.arm.strategy, self.arm.rule, str(self.seed), str(self.examples), *self.rooms.words))
 
     def results(self) -> Json:
         """Likeliest next observations (N, ...) of the examples, as lists."""
-        spec = DataSpec("mixture", self.pool_transitions, self._first() + 1)
-        pool = load(spec, self.folder / "data")
-        *_, last = Experiment(self.arm, self.seed, spec.spaces, pool, self.folder / "networks").rounds()
+        data = self.rooms.load()
+        experiment = Experiment(
+            self.arm, self.seed, data.spaces, data.pool, self.networks, seed_set=data.seed_set, video=data.video
+        )
+        *_, last = experiment.rounds()
         assert last.models.world_model is not None
-        guess = predicted(last.models.world_model, self.shown())
-        correct, changed = changes(guess, self.shown().observations)
+        shown = self.shown()
+        guess = predicted(last.models.world_model, shown)
+        correct, changed = changes(guess, shown.observations)
         return {
             "arm": self.arm.name,
             "labels": last.labeled.size,
@@ -64,11 +66,7 @@ class PredictionsRun:
 
     def shown(self) -> SegmentBatch:
         """For each example one effective transition of each action, in the order of the actions."""
-        test = DataSpec("balanced", 200_000, self._first() + 2, per_action=500)
-        return examples_of(draw_test_labels(load(test, self.folder / "data")), self.examples)
-
-    def _first(self) -> int:
-        return TUNING if self.tuning else REPORTED
+        return examples_of(self.rooms.load().tests["balanced"], self.examples)
 
 
 def examples_of(test: SegmentBatch, examples: int) -> SegmentBatch:
@@ -89,12 +87,15 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     """Train what is missing and draw a picture an example. No figure has a target."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_options(parser, "9")
+    add_files(parser)
     arms = [Arm("random", "top"), Arm("cycle", "kmeans_plus_plus")]
     parser.add_argument("--arms", nargs="+", default=arms, type=Arm.parse)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--examples", type=int, default=3)
     asked = parser.parse_args(argv)
-    runs = [PredictionsRun(arm, asked.seed, asked.examples, asked.out, asked.tuning) for arm in asked.arms]
+    rooms = Rooms.of(asked)
+    runs = [PredictionsRun(arm, asked.seed, asked.examples, rooms, asked.out / "networks") for arm in asked.arms]
+    rooms.load()  # once, before processes ask for it
     run_missing(runs, asked.out, asked.processes, asked.threads)
     found = results(runs, asked.out)
     shown = runs[0].shown()
@@ -103,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
         rows = slice(example * ACTIONS, (example + 1) * ACTIONS)
         of_example = {name: {key: stream[rows] for key, stream in guess.items()} for name, guess in guesses.items()}
         draw_predictions(shown.take(rows), of_example, asked.out / f"9-{example + 1}.png")
-    return [Figure(f"9_dynamics_accuracy_{each['arm']}", each["accuracy"], "share") for each in found]
+    return [Figure(f"9_changes_right_{each['arm']}", each["accuracy"], "share") for each in found]
 
 
 def draw_predictions(shown: SegmentBatch, guesses: dict[str, Observations], path: Path) -> int:
