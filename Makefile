@@ -59,7 +59,7 @@ bench-acquire: setup ## latency of POST /acquire with a ready queue
 bench-score: setup ## the scoring job beside the networks' bare forward pass
 	$(BIN)/python -m benchmarks.service.score
 
-bench-paper-minigrid: setup ## the paper's MiniGrid figures, at most 90 minutes on 2 cores, resumable (QUICK=1: 4a and 4d, 10 minutes)
+bench-paper-minigrid: setup ## the paper's MiniGrid figures, resumable (QUICK=1: 4a and 4d with four arms)
 	$(BIN)/python -m benchmarks.paper.minigrid $(if $(QUICK),--quick)
 
 bench-paper-minigrid-full: setup ## the same with every strategy under every batch rule: hours, resumable

@@ -58,3 +58,11 @@ def test_the_quick_extent_is_4a_and_4d_with_four_arms_and_three_seeds() -> None:
 
 def test_4d_comes_last_but_for_what_reads_its_results() -> None:
     assert [part.folder for part in parts("usual", Path("results"))][-3:] == ["4d", "4d", "8"]
+
+
+def test_a_part_runs_its_module_with_the_shared_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    chosen = [part for part in parts("usual", tmp_path) if part.folder == "8"]
+    assert run(chosen, ["--processes", "1", "--threads", "1", "--tuning"], tmp_path) == []
+    said = capsys.readouterr().out
+    assert f"{tmp_path / '4d'} holds no finished result" in said
+    assert "s, 0 targets missed" in said
