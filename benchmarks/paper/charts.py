@@ -30,6 +30,7 @@ def curves(groups: Mapping[str, Sequence[tuple[float, Estimate]]], across: str, 
     for group, points in groups.items():
         values = [value for _, value in points]
         axes.errorbar([x for x, _ in points], [each.mean for each in values], _errors(values), label=group, capsize=2)
+    axes.set_xticks(sorted({x for points in groups.values() for x, _ in points}))
     axes.set_xlabel(across)
     _save(figure, axes, path)
 

@@ -30,7 +30,7 @@ def print_tables(figures: Sequence[Name], found: Sequence[Json]) -> None:
         print(" | ".join((AXES[figure], "draw", "seeds", "predictor", *GROUPS, "actions inferred")))
         for point, draw in product(POINTS[figure], DRAWS):
             tests = tests_at(found, point, draw)
-            for predictor in (name for name in PREDICTORS if tests and name in tests[0][counted]):
+            for predictor in predictors_of(tests, counted):
                 cells = [str(_estimate(tests, counted, predictor, group)) for group in GROUPS]
                 inferred = [each["inferred"][predictor]["overall"] for each in tests if predictor in FORMS]
                 cells.append(str(estimate(inferred)) if inferred else "")
@@ -58,7 +58,7 @@ def draw_charts(figures: Sequence[Name], found: Sequence[Json], out: Path) -> No
         lines = dict[str, list[tuple[float, Estimate]]]()
         for predictor, draw, point in product(PREDICTORS, DRAWS, POINTS[figure]):
             tests = tests_at(found, point, draw)
-            if tests and predictor in tests[0][counted]:
+            if predictor in predictors_of(tests, counted):
                 value = _estimate(tests, counted, predictor, group)
                 lines.setdefault(f"{predictor}, {draw}", []).append((point.x, value))
         if lines:
@@ -89,6 +89,12 @@ def tests_at(found: Sequence[Json], point: Point, draw: Draw) -> list[Json]:
         if (each["draw"], each["labels"], each["trained"]) == (draw, point.labels, point.trained.name)
         and point.tested.name in each["tests"]
     ]
+
+
+def predictors_of(tests: Sequence[Json], counted: str) -> list[str]:
+    """Those that the tests tell of. Without the tiles another chance changes nothing, so it is left out there."""
+    known = tests[0][counted] if tests else ()
+    return [name for name in PREDICTORS if name in known and not (counted == "masked" and name.endswith(FRESH))]
 
 
 def _charts(figures: Sequence[Name]) -> Iterator[tuple[Name, str, str]]:
