@@ -61,8 +61,7 @@ def test_every_code_can_be_drawn(tmp_path: Path) -> None:
     codes = np.array(list(product(*map(range, CHANNEL_SIZES))), np.uint8)
     grid = np.resize(codes, (19, 19, 3))
     figure = Figure()
-    for carried in (codes[-1], codes[0]):
-        draw_observation(figure.subplots(), grid, carried)
+    draw_observation(figure.subplots(), grid, codes[-1])
     figure.savefig(tmp_path / "codes.png", dpi=20)
 
 
