@@ -29,6 +29,7 @@ from models.segments import Observations, SegmentBatch
 from models.spaces import Spaces
 
 OPEN = 2.0  # added to every gate's logit, so that training begins with the gates open
+GAIN = 10.0  # of a gate that is a parameter itself: Adam moves it by the learning rate, and there are few steps
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,7 @@ class GridLatentMaskedInverseDynamics(nn.Module):
         size = spaces.observations["grid"].shape[0]
         self.encoder = cells.GridEncoder(size, config.channels)
         self.pool = cells.PooledHead(size, config.channels, config.hidden, config.latent)
-        self.gates = table(1, config.latent, 0.1)
+        self.gates = table(1, config.latent, 0.01)
         self.penalty = PenaltyRamp(config.sparsity, config.free, config.ramp)
         self.head = Mlp((2 * config.latent, config.hidden, action_count(spaces)))
         initialise(self, generator)
@@ -224,7 +225,7 @@ class GridLatentMaskedInverseDynamics(nn.Module):
         return torch.cat([z[:, gates == 0] for z in self._encode(observations)], 1)
 
     def _gates(self) -> Tensor:
-        return self.gates + OPEN  # (1, D)
+        return GAIN * self.gates + OPEN  # (1, D)
 
     def _encode(self, observations: Observations) -> tuple[Tensor, Tensor]:
         """z_t and z_{t+1}, each (B*L, D). Every frame is encoded once."""

@@ -75,9 +75,9 @@ def test_what_is_read_and_what_is_left_out_are_the_whole_observation(
     assert masked.verifying_block(held_out.observations).shape == (held_out.size, 3 * 2 * 22)
 
 
-@pytest.mark.parametrize("sparsity", [0.0, 1.0])
+@pytest.mark.parametrize("sparsity", [0.0, 0.1])
 def test_a_mask_over_latent_coordinates_closes_under_its_penalty(sparsity: float) -> None:
-    """Without a price all coordinates stay open; at the price of a nat each most are given up."""
+    """Without a price all coordinates stay open; at a tenth of a nat each most are given up."""
     generator = torch.Generator().manual_seed(3)
     config = MaskedInverseDynamicsConfig(over="latent", sparsity=sparsity, free=20, ramp=40, latent=16)
     model = GRID.build_inverse_dynamics(toy_grid.SPACES, "masked", config, generator)
@@ -85,6 +85,6 @@ def test_a_mask_over_latent_coordinates_closes_under_its_penalty(sparsity: float
     train(model, labeled, GRID.training_config(model.kind, labeled.size), generator)
     kept = model.kept(labeled.observations)
     assert int(kept.min()) == int(kept.max())
-    assert (int(kept[0]) == 16) if sparsity == 0.0 else (int(kept[0]) < 8)
+    assert (int(kept[0]) == 16) if sparsity == 0.0 else (1 <= int(kept[0]) <= 8)
     with torch.inference_mode():
         assert bool(torch.isfinite(model.log_prob(labeled)).all())
