@@ -7,7 +7,7 @@ An arm is `strategy:rule`. All arms get the same pool, seed labels, budgets, sch
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -15,16 +15,18 @@ from torch import Tensor
 
 from benchmarks.figures import Figure, finish
 from benchmarks.paper.minigrid import acquisition_table
+from benchmarks.paper.minigrid.action_following import action_following
 from benchmarks.paper.minigrid.arms import Arm
 from benchmarks.paper.minigrid.datasets import ACTIONS
 from benchmarks.paper.minigrid.loop import Experiment, Round, errors, pool_losses, strategy_scores
-from benchmarks.paper.minigrid.rooms import Rooms, add_files
+from benchmarks.paper.minigrid.rooms import Data, Rooms, add_files
 from benchmarks.paper.runs import Json, add_options, results, run_missing
 from models.diagnostics import explanations, true_loss
 from models.evaluation import transition_errors
 from models.rank_correlation import kendall, spearman
 from models.segments import SegmentBatch
 
+MOST_SEEDS = 100
 MOVEMENT = 3  # actions below it are movements
 WITHOUT_RANKS = ("random", "no_score", "oracle_uniform", "fidelity")  # their scores are draws, or turn on the pool
 DEFAULT = Arm("cycle", "kmeans_plus_plus")
@@ -51,7 +53,7 @@ class ArmRun:
         experiment = Experiment(
             self.arm, self.seed, data.spaces, data.pool, self.networks, seed_set=data.seed_set, video=data.video
         )
-        rounds = [_told(self.arm, found, data.tests, data.pool) for found in experiment.rounds()]
+        rounds = [_told(self.arm, found, data) for found in experiment.rounds()]
         return {"arm": self.arm.name, "seed": self.seed, "rounds": rounds}
 
 
@@ -70,17 +72,21 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     runs = [ArmRun(arm, seed, rooms, asked.out / "networks") for seed, arm in order]
     rooms.load()  # once, before processes ask for it
     run_missing(runs, asked.out, asked.processes, asked.threads)
-    return acquisition_table.tell(results(runs, asked.out), DEFAULT, asked.out)
+    # Arms that have finished more seeds before are told with all of them.
+    finished = [replace(run, seed=seed) for seed in range(MOST_SEEDS) for run in runs if run.seed == 0]
+    return acquisition_table.tell(results(finished, asked.out), DEFAULT, asked.out)
 
 
-def _told(arm: Arm, found: Round, tests: dict[str, SegmentBatch], pool: SegmentBatch) -> Json:
+def _told(arm: Arm, found: Round, data: Data) -> Json:
     told: Json = {"labels": found.labeled.size}
-    for name, error in errors(found.models, tests).items():
+    for name, error in errors(found.models, data.tests).items():
         groups = {"overall": error.overall, **error.groups}
         told[name] = {group: _short(asdict(each)) for group, each in groups.items()}
-    told["inverse_by_action"] = _inverse_by_action(found, tests["balanced"])
-    told["ranks"] = _ranks(arm, found, tests["natural"])
-    told["picks"] = _picks(found, pool)
+    told["inverse_by_action"] = _inverse_by_action(found, data.tests["balanced"])
+    told["ranks"] = _ranks(arm, found, data.tests["natural"])
+    told["picks"] = _picks(found, data.pool)
+    if data.outcomes is not None and found.models.world_model is not None:
+        told["action_following"] = action_following(found.models.world_model, data.outcomes)
     return told
 
 

@@ -52,6 +52,7 @@ COLUMNS: dict[str, Measure] = {
     "natural exact": NATURAL_EXACT,
     "inverse": measure("balanced", "overall", "inverse"),
     "natural inverse": measure("natural", "overall", "inverse"),
+    "action following": lambda told: told.get("action_following"),
     "rank": rank("overall"),
     "rank moving": rank("movement"),
     "rank interacting": rank("interaction"),

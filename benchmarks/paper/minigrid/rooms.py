@@ -8,6 +8,7 @@ from pathlib import Path
 from torch.nn.functional import one_hot
 
 from benchmarks.paper.minigrid import foreign
+from benchmarks.paper.minigrid.action_following import Outcomes, load_outcomes
 from benchmarks.paper.minigrid.datasets import ACTIONS, REPORTED, TUNING, DataSpec, draw_test_labels, grid_spaces, load
 from models.segments import SegmentBatch
 from models.spaces import Spaces
@@ -22,12 +23,16 @@ FILES = {
 
 @dataclass(frozen=True)
 class Data:
-    """pool: with the hidden action sets. tests: by name. seed_set, video: None where they come from the pool."""
+    """pool: with the hidden action sets. tests: by name. seed_set, video: None where they come from the pool.
+
+    outcomes: for the action-following score; None where the rooms are a file's, in which nothing can be tried out.
+    """
 
     pool: SegmentBatch
     tests: dict[str, SegmentBatch]
     seed_set: SegmentBatch | None
     video: SegmentBatch | None
+    outcomes: Outcomes | None
 
     @property
     def spaces(self) -> Spaces:
@@ -86,7 +91,9 @@ def add_files(parser: argparse.ArgumentParser) -> None:
 def _load(rooms: Rooms) -> Data:
     """Once a process."""
     pool = _foreign(rooms.pool) or load(rooms.spec(1, "mixture", rooms.pool_transitions), rooms.folder)
-    return Data(pool, _tests(rooms), _foreign(rooms.seed_set), _foreign(rooms.video))
+    ours = rooms.pool is None and rooms.test_set is None
+    outcomes = load_outcomes(rooms.spec(4, "balanced", 200_000, per_action=100), rooms.folder) if ours else None
+    return Data(pool, _tests(rooms), _foreign(rooms.seed_set), _foreign(rooms.video), outcomes)
 
 
 def _tests(rooms: Rooms) -> dict[str, SegmentBatch]:
