@@ -55,7 +55,8 @@ class AcquisitionItem(Schema):
 class Acquisition(Schema):
     """One batch. `token` is given to the one who acquired it and must come back with the labels.
 
-    strategy: the one that ranked the batch; `requested_strategy` differs from it at a cold start, before any round.
+    strategy: the one that ranked the batch; `requested_strategy` differs from it at a cold start, before any round, and
+    in explore mode where that one cannot propose what to execute.
     reason: why the batch holds fewer items than were asked for; None where it holds them all.
     """
 

@@ -67,6 +67,17 @@ class SelectQueue(Schema):
     length: int
 
 
+class ProposeExplorations(Schema):
+    """Choose states of the pool and actions to execute there, by a strategy under its round's models.
+
+    length: about how many of them are kept ready.
+    """
+
+    kind: Literal["propose_explorations"] = "propose_explorations"
+    scoring: UUID
+    length: int
+
+
 class Canary(Schema):
     """Do nothing: that it was done shows that `queue` is served. It belongs to no project."""
 
@@ -75,7 +86,14 @@ class Canary(Schema):
 
 
 JobPayload = Annotated[
-    Collect | TrainRound | TrainSubgoalGenerator | ScoreShard | MergeScores | SelectQueue | Canary,
+    Collect
+    | TrainRound
+    | TrainSubgoalGenerator
+    | ScoreShard
+    | MergeScores
+    | SelectQueue
+    | ProposeExplorations
+    | Canary,
     Field(discriminator="kind"),
 ]
 
@@ -86,12 +104,14 @@ QUEUES: dict[str, Queue] = {  # a canary names its own
     "score_shard": "score",
     "merge_scores": "score",
     "select_queue": "score",
+    "propose_explorations": "score",
 }
 PRIORITIES: dict[str, int] = {  # others 0; higher goes first
     "canary": 100,
     "score_shard": 10,  # a queue that somebody waits for comes before the next training
     "merge_scores": 10,
     "select_queue": 10,
+    "propose_explorations": 10,
     "train_subgoal_generator": -10,
 }
 

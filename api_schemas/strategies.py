@@ -33,36 +33,45 @@ class Strategy(Schema):
     """`privileged` strategies see hidden actions: benchmarks only, a project is refused them.
 
     `needs` names the networks that it reads: the round trains them, but for the previous round's world model.
+    explores: it proposes what to execute in explore mode; for the others chance does.
     """
 
     name: StrategyName
     privileged: bool
     needs: tuple[str, ...]
+    explores: bool = False
     summary: str
 
 
-def _strategy(name: StrategyName, needs: tuple[str, ...], summary: str, *, privileged: bool = False) -> Strategy:
-    return Strategy(name=name, privileged=privileged, needs=needs, summary=summary)
+def _strategy(
+    name: StrategyName, needs: tuple[str, ...], summary: str, *, privileged: bool = False, explores: bool = False
+) -> Strategy:
+    return Strategy(name=name, privileged=privileged, needs=needs, explores=explores, summary=summary)
 
 
 _CYCLE = ("inverse_dynamics", "world_model")
 CATALOG: tuple[Strategy, ...] = (
     _strategy("random", (), "Segments in uniformly random order; needs no model."),
-    _strategy("cycle", _CYCLE, "Forward-inverse cycle error under the sparse inverse model (equation 7)."),
+    _strategy(
+        "cycle", _CYCLE, "Forward-inverse cycle error under the sparse inverse model (equation 7).", explores=True
+    ),
     _strategy(
         "confident_cycle",
         _CYCLE,
         "Cycle error over all actions that the inverse model thinks possible: what it doubts ranks lower.",
+        explores=True,
     ),
     _strategy(
         "masked_cycle",
         ("masked_inverse_dynamics", "world_model"),
         "The same cycle error under an inverse model that learns what to look at.",
+        explores=True,
     ),
     _strategy(
         "vanilla_cycle",
         ("dense_inverse_dynamics", "world_model"),
         "The same cycle error under an inverse model that sees the whole observation.",
+        explores=True,
     ),
     _strategy("self_inverse", ("world_model",), "Cycle error with the world model as its own inverse: a control."),
     _strategy(

@@ -3,14 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from typing import cast
 from uuid import UUID
 
 from sqlalchemy.orm import Session
 
 from api_schemas.acquisitions import AcquireRequest, Acquisition, AcquisitionItem
+from api_schemas.labels import Action
 from api_schemas.projects import Budget
 from api_schemas.strategies import STRATEGY_NAMES
-from service import draws, events, leases, projects, scorings
+from service import draws, events, leases, projects, proposals, scorings
 from service.clock import Clock
 from service.draws import Candidate
 from service.errors import BudgetExhausted, NothingToExplore, PoolExhausted, UnknownStrategy
@@ -23,6 +25,8 @@ from service.store.tables import (
     AcquisitionRow,
     JobRow,
     ProjectRow,
+    QueueRow,
+    RoundRow,
     ScoringRow,
 )
 
@@ -61,12 +65,15 @@ def acquire(session: Session, request: AcquireRequest, clock: Clock, limits: sco
     requested = _known(request.strategy or projects.policy_of(project).strategy)
     ranked = request.purpose == "pool" and request.mode == "pool"
     first = _front_of_queue(session, project, requested, request.count, clock()) if ranked else None
-    states = draws.states(session, project) if request.mode == "explore" else None
+    chooses = proposals.proposing(session, project, requested) if request.mode == "explore" else None
+    states = draws.states(session, project) if request.mode == "explore" and chooses is None else None
     project, now = projects.find(session, request.project, lock=True), clock()
     leased = pool_queries.leased(session, project.id, now)
     room = _room(project, request, leased)
-    if states is not None:
-        drawn: Draw | JobRow = _draw_explorations(project, states, room)
+    if chooses is not None:
+        drawn: Draw | JobRow = _draw_proposals(session, project, requested, chooses, room, now, limits)
+    elif states is not None:
+        drawn = _draw_explorations(project, states, room)
     elif request.purpose == "held_out":
         drawn = Draw("random", draws.held_out(session, project, room.count, now), reason=room.reason)
     else:
@@ -180,8 +187,32 @@ def _ranked(scoring: ScoringRow, rows: Sequence[Queued], room: Room) -> Draw:
     return Draw(scoring.strategy, candidates, room.reason, scoring)
 
 
+def _draw_proposals(
+    session: Session,
+    project: ProjectRow,
+    strategy: str,
+    round_row: RoundRow,
+    room: Room,
+    now: datetime,
+    limits: scorings.Limits,
+) -> Draw | JobRow:
+    """States and actions that the strategy proposes under the round's models."""
+    taken = proposals.take(session, project, strategy, round_row, room.count, now, limits)
+    if isinstance(taken, JobRow):
+        return taken
+    scoring, rows = taken
+    left = f"{room.count} were asked for, {len(rows)} explorations were ready"
+    candidates = [Candidate(row.trajectory_id, row.start, row.score, _actions(row)) for row in rows]
+    return Draw(strategy, candidates, room.reason if len(rows) == room.count else left, scoring)
+
+
+def _actions(row: QueueRow) -> list[Action]:
+    """To execute; a worker wrote them, one by one in the form of labels."""
+    return cast(list[Action], row.actions)
+
+
 def _draw_explorations(project: ProjectRow, states: draws.States, room: Room) -> Draw:
-    """States of the pool and actions to execute there, both drawn uniformly: no model proposes any yet."""
+    """States of the pool and actions to execute there, both drawn uniformly: there is no model that proposes any."""
     candidates = draws.explorations(project, states, room.count)
     if not candidates:
         raise NothingToExplore(project.id, projects.environment_of(project).simulator)
@@ -219,6 +250,8 @@ def _lease(
 
 def _pass_over(session: Session, row: AcquisitionRow, draw: Draw) -> None:
     """Spare the next one a look at the claims of these. Rows that others may hold are left alone where they do."""
+    if row.mode == "explore":  # claims no segment
+        return
     if draw.scoring is not None and draw.locked:
         queries.note_leased(session, draw.scoring.id, draw.locked, row.lease_expires_at)
     elif draw.scoring is not None:

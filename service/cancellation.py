@@ -22,6 +22,8 @@ def cancel(session: Session, job_id: UUID, now: datetime) -> JobRow:
     row = jobs.cancel(session, job_id, now)
     if row.kind == "train_round":
         rounds.cancel(session, row.subject_id, now)
+    elif row.kind == "propose_explorations":
+        scorings.fail(session, row.subject_id, now)
     elif row.kind in ("score_shard", "merge_scores"):
         _cancel_scoring(session, row.subject_id, now)
     return row

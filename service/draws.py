@@ -47,6 +47,15 @@ class States:
     members: Sequence[queries.Member]
     ends: NDArray[np.int64]
 
+    @property
+    def count(self) -> int:
+        """How many states there are."""
+        return int(self.ends[-1]) if len(self.ends) else 0
+
+    def at(self, project: ProjectRow, place: int) -> tuple[str, int]:
+        """Trajectory and observation of the state at this place among all."""
+        return _segment(project, self.members, self.ends, place)
+
 
 def states(session: Session, project: ProjectRow) -> States:
     """What can be explored from. It takes a while in a large pool, and needs no lock: members stay.
@@ -60,11 +69,11 @@ def states(session: Session, project: ProjectRow) -> States:
 
 def explorations(project: ProjectRow, states: States, count: int) -> list[Candidate]:
     """`count` of the states and a segment's worth of actions for each, both uniform; none where there is no state."""
-    if not len(states.ends) or not states.ends[-1]:
+    if not states.count:
         return []
     rng = _generator(project)
-    places = rng.integers(0, states.ends[-1], count)
-    segments = [_segment(project, states.members, states.ends, int(place)) for place in places]
+    places = rng.integers(0, states.count, count)
+    segments = [states.at(project, int(place)) for place in places]
     return [Candidate(*segment, actions=_actions(project, rng)) for segment in segments]
 
 

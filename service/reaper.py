@@ -33,6 +33,8 @@ def give_up(session: Session, row: JobRow, now: datetime) -> None:
     error = f"job {row.id} ({row.kind}): {row.error}"
     if row.kind == "train_round":
         rounds.fail(session, row.subject_id, error, now)
+    elif row.kind == "propose_explorations":
+        scorings.fail(session, row.subject_id, now)
     elif row.kind in ("score_shard", "merge_scores"):
         scorings.fail(session, row.subject_id, now)
         round_id = scorings.find(session, row.subject_id).round_id

@@ -8,6 +8,7 @@ from uuid import UUID
 from sqlalchemy.orm import Session
 
 from api_schemas.jobs import MergeScores, ScoreShard, SelectQueue, TrainRound
+from api_schemas.labels import Action
 from api_schemas.strategies import CATALOG, COLD_START_STRATEGY
 from service import events, jobs
 from service.errors import UnknownResource
@@ -39,11 +40,12 @@ def limits_of(settings: Settings) -> Limits:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A segment at its place in the queue."""
+    """A segment at its place in the queue, or an observation and the actions to execute from it on."""
 
     trajectory: str
     start: int
     score: float
+    actions: Sequence[Action] | None = None
 
 
 def ready(session: Session, project: ProjectRow, requested: str) -> ScoringRow | None:
@@ -91,7 +93,7 @@ def start(
     )
     session.add(scoring)
     session.flush()
-    _tell(session, scoring, "started", now, shards=len(cuts))
+    tell(session, scoring, "started", now, shards=len(cuts))
     for number, (first, last) in enumerate(cuts):
         session.add(ShardRow(scoring_id=scoring.id, number=number, first=first, last=last))
         payload = ScoreShard(scoring=scoring.id, shard=number)
@@ -147,13 +149,14 @@ def publish(session: Session, scoring_id: UUID, ranked: Sequence[Ranked], now: d
             trajectory_id=segment.trajectory,
             start=segment.start,
             score=segment.score,
+            actions=None if segment.actions is None else list(segment.actions),
         )
         for rank, segment in enumerate(ranked)
     ]
     queries.replace_queue(session, scoring, rows)
     scoring.status = "ready"
     scoring.selections += 1
-    _tell(session, scoring, "ready", now, queued=len(ranked))
+    tell(session, scoring, "ready", now, queued=len(ranked))
     return scoring
 
 
@@ -170,7 +173,13 @@ def fail(session: Session, scoring_id: UUID, now: datetime) -> None:
     scoring = find(session, scoring_id, lock=True)
     if scoring.status != "failed":
         scoring.status = "failed"
-        _tell(session, scoring, "failed", now)
+        tell(session, scoring, "failed", now)
+
+
+def tell(session: Session, scoring: ScoringRow, what: str, now: datetime, **more: object) -> None:
+    """An event of a scoring."""
+    data = {"scoring": str(scoring.id), "strategy": scoring.strategy, "mode": scoring.mode, **more}
+    events.record(session, scoring.project_id, f"scoring.{what}", data, now)
 
 
 def _ranking(session: Session, project: ProjectRow, requested: str) -> tuple[str, RoundRow | None]:
@@ -191,11 +200,6 @@ def _request(
         return waiting or jobs.enqueue(session, project.id, payload, round_row.id, now, limits.max_attempts)
     scoring = start(session, project, strategy, round_row, now, limits)
     return _waiting(session, scoring, now, limits)
-
-
-def _tell(session: Session, scoring: ScoringRow, what: str, now: datetime, **more: object) -> None:
-    data = {"scoring": str(scoring.id), "strategy": scoring.strategy, **more}
-    events.record(session, scoring.project_id, f"scoring.{what}", data, now)
 
 
 def _outgrown(session: Session, scoring: ScoringRow) -> bool:

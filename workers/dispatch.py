@@ -14,6 +14,7 @@ from api_schemas.jobs import (
     Collect,
     JobPayload,
     MergeScores,
+    ProposeExplorations,
     ScoreShard,
     SelectQueue,
     TrainRound,
@@ -103,17 +104,23 @@ def _run(job: RunningJob, payload: JobPayload) -> Result:
             from workers.training import run_subgoal_generator
 
             return run_subgoal_generator(job, payload)
-        case ScoreShard():
-            from workers.scoring import run_shard
-
-            return run_shard(job, payload)
-        case MergeScores() | SelectQueue():
-            from workers.scoring import run_selection
-
-            length = payload.length if isinstance(payload, SelectQueue) else job.worker.settings.queue_length
-            return run_selection(job, payload.scoring, length)
         case Canary():
             return canary.done(job.now())
+        case _:
+            return _score(job, payload)
+
+
+def _score(job: RunningJob, payload: ScoreShard | MergeScores | SelectQueue | ProposeExplorations) -> Result:
+    if isinstance(payload, ProposeExplorations):
+        from workers.exploration import run_proposals
+
+        return run_proposals(job, payload.scoring, payload.length)
+    from workers.scoring import run_selection, run_shard
+
+    if isinstance(payload, ScoreShard):
+        return run_shard(job, payload)
+    length = payload.length if isinstance(payload, SelectQueue) else job.worker.settings.queue_length
+    return run_selection(job, payload.scoring, length)
 
 
 def _give_back(job: RunningJob, reason: GaveWay) -> None:

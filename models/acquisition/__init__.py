@@ -19,9 +19,11 @@ from models.acquisition.vanilla_cycle import VanillaCycle
 
 __all__ = [
     "BATCH_RULES",
+    "EXPLORING",
     "STRATEGIES",
     "BatchRule",
     "Candidates",
+    "Cycle",
     "Models",
     "NonFiniteScoreError",
     "Strategy",
@@ -48,3 +50,8 @@ _ALL: tuple[Strategy, ...] = (
     OracleUniform(),
 )
 STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in _ALL}
+EXPLORING: dict[str, Cycle] = {
+    **{strategy.name: strategy for strategy in _ALL if isinstance(strategy, Cycle)},
+    "confident_cycle": Cycle("confident_cycle"),  # explore mode filters by confidence as it is
+}
+"""Those that propose what to execute, and whose inverse dynamics infers the actions of imagined futures."""

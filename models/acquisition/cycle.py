@@ -30,13 +30,14 @@ class Cycle:
 
     def actions(self, models: Models, batch: SegmentBatch) -> Tensor:
         """The inferred ones."""
-        return self._verifier(models).infer(batch.observations)
+        return self.verifier(models).infer(batch.observations)
 
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """(B,) in the world model's distance. Draws nothing from the generator."""
         world_model = given(self, "world_model", models.world_model)
-        return cycle_error(world_model, self._verifier(models), batch.observations)
+        return cycle_error(world_model, self.verifier(models), batch.observations)
 
-    def _verifier(self, models: Models) -> DiscreteInverseDynamics:
-        verifier: DiscreteInverseDynamics | None = getattr(models, self.inverse)
-        return given(self, self.inverse, verifier)
+    def verifier(self, models: Models) -> DiscreteInverseDynamics:
+        """Whose inverse dynamics infers. Raises ValueError where the round has not trained it."""
+        trained: DiscreteInverseDynamics | None = getattr(models, self.inverse)
+        return given(self, self.inverse, trained)

@@ -1,11 +1,25 @@
 """What every subgoal generator offers."""
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
+from torch import Tensor
 
 from models.network import Network
 from models.segments import Observations
+
+
+class Futures(NamedTuple):
+    """M different chains, several of them from each of B states.
+
+    chains: streams (M, K+1, ...). states int64 (M,): the row of the state that each begins at. log_prob (M,): nats, up
+    to a constant. steady bool (M,): those that the generator stands by.
+    """
+
+    chains: Observations
+    states: Tensor
+    log_prob: Tensor
+    steady: Tensor
 
 
 class SubgoalGenerator(Network, Protocol):
@@ -13,4 +27,11 @@ class SubgoalGenerator(Network, Protocol):
 
     def sample(self, observations: Observations, horizon: int, generator: torch.Generator) -> Observations:
         """Equation 4: observations x_t (B, ...) -> one chain each (B, K+1, ...), whose first element is x_t."""
+        ...
+
+    def futures(self, observations: Observations, horizon: int, generator: torch.Generator) -> Futures:
+        """What may follow x_t (B, ...) in K steps, the rare with the usual; that nothing happens is always among it.
+
+        Samples show what is usual. What is worth executing is rare.
+        """
         ...

@@ -1,5 +1,7 @@
 """Subgoal generator of grid worlds: a latent-categorical model of the next observation."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,9 +11,11 @@ from torch.nn import functional as F
 from models.networks import grid as cells
 from models.networks.film import FilmDynamics
 from models.networks.initialisation import gumbel, initialise, table
-from models.networks.symmetry import turned
+from models.networks.mlp import Mlp
+from models.networks.symmetry import DIRECTIONS, turn, turned
 from models.segments import Observations, SegmentBatch, at
 from models.spaces import Spaces
+from models.subgoal_generators.base import Futures
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,9 @@ class GridSubgoalGeneratorConfig:
     hidden: int = 64
     exploration: float = 0.1  # share of pairs trained with a random code
     prior_weight: float = 0.02  # of -log p(k|x) in the choice of a pair's code: keeps outcomes from being split up
+    floor: float = 1e-3  # a future whose code is less likely is none
+    idle: float = 0.02  # what the future is taken to be worth in which nothing happens
+    agreeing: int = 3  # of the four turns of a room, in which a future must come out alike to be stood by
 
 
 class GridSubgoalGenerator(nn.Module):
@@ -44,7 +51,7 @@ class GridSubgoalGenerator(nn.Module):
         self.spaces, self.config = spaces, config
         self.size = spaces.observations["grid"].shape[0]
         self.encoder = cells.GridEncoder(self.size, config.channels)
-        self.prior = cells.PooledHead(self.size, config.channels, config.hidden, config.codes)
+        self.prior = Mlp((4 * config.channels, config.hidden, config.codes))
         self.codes = table(config.codes, config.code_size)
         self.dynamics = FilmDynamics(config.code_size, config.channels, self.size, self.size, config.blocks)
         self.decoder = cells.GridDecoder(config.channels, config.hidden)
@@ -62,7 +69,7 @@ class GridSubgoalGenerator(nn.Module):
         pairs = turned(batch.transitions(), generator).observations
         before, after = at(pairs, 0), at(pairs, 1)
         state: Tensor = self.encoder((before,))
-        prior = self.prior(state).log_softmax(1)  # (B, K)
+        prior = self._log_prior(before, state)  # (B, K)
         best = self._best_codes(state.detach(), prior.detach(), after)
         used = self._explored(best, generator)
         reconstruction = cells.observation_cross_entropy(self._decode(state, used), after)
@@ -73,10 +80,59 @@ class GridSubgoalGenerator(nn.Module):
         chain = [observations]
         for _ in range(horizon):
             state: Tensor = self.encoder((chain[-1],))
-            logits: Tensor = self.prior(state)
-            choice = (logits + gumbel(logits.shape, generator, logits.device)).argmax(1)
+            prior = self._log_prior(chain[-1], state)
+            choice = (prior + gumbel(prior.shape, generator, prior.device)).argmax(1)
             chain.append(cells.decoded_modes(self._decode(state, choice), self.size))
         return {name: torch.stack([step[name] for step in chain], 1) for name in ("grid", "carried")}
+
+    def futures(self, observations: Observations, horizon: int, generator: torch.Generator) -> Futures:
+        """A chain for every code above the floor; at later steps a code is drawn, all above the floor equally likely.
+
+        It stands by those that it would also give, turned, if the room were turned, by at most one quarter less: a
+        decoder that is trained on all turns and still disagrees with itself has seen too little of such a step.
+        """
+        prior = self._log_prior(observations, self.encoder((observations,)))  # (B, codes)
+        rows, codes = (prior > math.log(self.config.floor)).nonzero().unbind(1)
+        chain, log_prob = [_rows(observations, rows)], torch.zeros_like(prior[:, 0])[rows]
+        steady = torch.ones_like(rows, dtype=torch.bool)
+        for step in range(horizon):
+            if step:
+                prior = self._log_prior(chain[-1], self.encoder((chain[-1],)))
+                codes = _uniform(prior > math.log(self.config.floor), generator)
+            likelihood = prior[rows if step == 0 else torch.arange(len(rows), device=rows.device), codes]
+            following, doubt = self._step(chain[-1], codes)
+            log_prob = log_prob + likelihood - doubt
+            steady = steady & (self._agreeing(chain[-1], codes, following) >= self.config.agreeing)
+            chain.append(following)
+        return _with_idle(observations, chain, Futures({}, rows, log_prob, steady), math.log(self.config.idle))
+
+    def _step(self, observations: Observations, codes: Tensor) -> tuple[Observations, Tensor]:
+        """The likeliest outcome of codes (M,), and how unsure of it the decoder is: nats (M,)."""
+        logits = self._decode(self.encoder((observations,)), codes)
+        following = cells.decoded_modes(logits, self.size)
+        return following, cells.observation_cross_entropy(logits, following)
+
+    def _agreeing(self, observations: Observations, codes: Tensor, following: Observations) -> Tensor:
+        """In how many of the four turns of the room the codes (M,) have this outcome: (M,)."""
+        agreeing = torch.ones_like(codes)
+        for count in range(1, DIRECTIONS):
+            quarters = torch.full_like(codes, count)
+            room = turn(observations["grid"].unsqueeze(1), quarters).squeeze(1)
+            outcome, _ = self._step({**observations, "grid": room}, codes)
+            back = turn(outcome["grid"].unsqueeze(1), DIRECTIONS - quarters).squeeze(1)
+            same = (back == following["grid"]).flatten(1).all(1) & (outcome["carried"] == following["carried"]).all(1)
+            agreeing += same
+        return agreeing
+
+    def _log_prior(self, observations: Observations, state: Tensor) -> Tensor:
+        """log p(k | x) of observations (B, ...) and their states (B, S, S, C): (B, codes).
+
+        What can follow depends on what lies before the agent first of all: a pool over all cells blurs it.
+        """
+        flat = state.flatten(1, 2)  # (B, S*S, C)
+        local = cells.gather_cells(flat, cells.touched_cells(observations["grid"])).flatten(1)
+        prior: Tensor = self.prior(torch.cat((local, flat.mean(1), flat.amax(1)), 1))
+        return prior.log_softmax(1)
 
     def _explored(self, best: Tensor, generator: torch.Generator) -> Tensor:
         """A share of the codes (B,) replaced by random ones: a code that never wins still learns what is usual."""
@@ -100,6 +156,30 @@ class GridSubgoalGenerator(nn.Module):
         film = self.dynamics.parameters_of(self.codes)  # once a code, not once a row
         logits: Observations = self.decoder(self.dynamics(state, film[codes]))
         return logits
+
+
+def _rows(observations: Observations, rows: Tensor) -> Observations:
+    return {name: stream[rows] for name, stream in observations.items()}
+
+
+def _with_idle(observations: Observations, chain: Sequence[Observations], found: Futures, log_prob: float) -> Futures:
+    """The futures with their chains, and of each state one more in which nothing happens."""
+    count = len(observations["grid"])
+    still = {name: torch.stack([stream] * len(chain), 1) for name, stream in observations.items()}
+    chains = {name: torch.cat((torch.stack([step[name] for step in chain], 1), still[name])) for name in still}
+    every = torch.arange(count, device=found.states.device)
+    return Futures(
+        chains,
+        torch.cat((found.states, every)),
+        torch.cat((found.log_prob, found.log_prob.new_full((count,), log_prob))),
+        torch.cat((found.steady, torch.zeros_like(every, dtype=torch.bool))),
+    )
+
+
+def _uniform(allowed: Tensor, generator: torch.Generator) -> Tensor:
+    """One of the columns allowed in each row: bool (B, K) -> (B,)."""
+    draw = torch.rand(allowed.shape, generator=generator, device=generator.device).to(allowed.device)
+    return (draw * allowed).argmax(1)
 
 
 def _refuse_actions(batch: SegmentBatch) -> None:

@@ -24,7 +24,7 @@ from api_schemas.strategies import (
     PRIVILEGED,
     STRATEGY_NAMES,
 )
-from models.acquisition import BATCH_RULES, STRATEGIES
+from models.acquisition import BATCH_RULES, EXPLORING, STRATEGIES
 from models.acquisition.base import Models
 from workers.simulators import minigrid
 from workers.simulators.base import OptionError
@@ -98,6 +98,7 @@ def test_strategies_are_those_of_the_science() -> None:
     assert {DEFAULT_STRATEGY, COLD_START_STRATEGY} <= set(STRATEGY_NAMES) - PRIVILEGED
     assert set(BATCH_RULE_NAMES) == set(BATCH_RULES) >= {DEFAULT_BATCH_RULE}
     assert not STRATEGIES[COLD_START_STRATEGY].needs
+    assert {strategy.name for strategy in CATALOG if strategy.explores} == set(EXPLORING)
 
 
 def test_a_box_of_seven_joints_is_a_space() -> None:

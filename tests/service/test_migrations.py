@@ -257,6 +257,41 @@ def test_going_back_before_the_diagnostics_forgets_them_alone(url: str) -> None:
     assert _differences(url) == []
 
 
+def test_going_back_before_explorations_forgets_what_was_only_proposed(url: str) -> None:
+    migrate(url, "0001")
+    fill(url)
+    migrate(url, "0005")
+    before, schema = read(url), _schema(url)
+    migrate(url, "0006")
+    assert {row["mode"] for row in read(url)["scoring"]} == {"pool"}
+    assert {row["actions"] for row in read(url)["queue"]} == {None}
+    scored, proposed = (_quoted(url, UUID(int=FIRST.int + more)) for more in (4, 40))
+    columns = "project_id, round_id, strategy, status, memberships, shards, selections, created_at"
+    places = "rank, project_id, trajectory_id, start, score"
+    scoring = f"INSERT INTO scoring (id, mode, {columns}) SELECT '{proposed}', 'explore', {columns} FROM scoring"  # noqa: S608
+    queue = f"INSERT INTO queue (scoring_id, actions, {places}) SELECT '{proposed}', '[6]', {places} FROM queue"  # noqa: S608
+    write(
+        url,
+        f"{scoring} WHERE id = '{scored}'",
+        f"{queue} WHERE scoring_id = '{scored}'",
+        "UPDATE job SET kind = 'propose_explorations' WHERE state = 'queued'",
+    )
+    assert len(read(url)["queue"]) == len(before["queue"]) + 1
+    _downgrade(url, "0005")
+    after = read(url)
+    assert (_version(url), _schema(url)) == ("0005", schema)
+    assert [row["kind"] for row in after.pop("job")] == ["train_round", "train_round"]  # those that were done
+    assert after == {name: rows for name, rows in before.items() if name != "job"}
+    _check_references(url)
+    migrate(url)
+    assert _differences(url) == []
+
+
+def _quoted(url: str, name: UUID) -> str:
+    """As the database writes it."""
+    return str(name) if "postgresql" in url else name.hex
+
+
 def test_a_migration_that_fails_in_the_middle_changes_nothing(url: str) -> None:
     migrate(url, "0001")
     write(url, "ALTER TABLE job ADD COLUMN checkpoint_stage VARCHAR(60)")  # the last column that the migration adds

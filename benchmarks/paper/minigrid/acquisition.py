@@ -7,7 +7,7 @@ An arm is `strategy:rule`. All arms get the same pool, seed labels, budgets, sch
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -16,8 +16,9 @@ from torch import Tensor
 from benchmarks.figures import Figure, finish
 from benchmarks.paper.minigrid import acquisition_table
 from benchmarks.paper.minigrid.action_following import action_following
-from benchmarks.paper.minigrid.arms import Arm
-from benchmarks.paper.minigrid.datasets import ACTIONS
+from benchmarks.paper.minigrid.arms import EXPLORERS, Arm
+from benchmarks.paper.minigrid.datasets import ACTIONS, load_states
+from benchmarks.paper.minigrid.exploration import Exploration
 from benchmarks.paper.minigrid.loop import Experiment, Round, errors, pool_losses, strategy_scores
 from benchmarks.paper.minigrid.rooms import Data, Rooms, add_files
 from benchmarks.paper.runs import Json, add_options, results, run_missing
@@ -28,7 +29,8 @@ from models.segments import SegmentBatch
 
 MOST_SEEDS = 100
 MOVEMENT = 3  # actions below it are movements
-WITHOUT_RANKS = ("random", "no_score", "oracle_uniform", "fidelity")  # their scores are draws, or turn on the pool
+WITHOUT_RANKS = ("random", "no_score", "oracle_uniform", "fidelity", *EXPLORERS)
+"""Their scores are draws, turn on the pool, or are of what was not observed."""
 DEFAULT = Arm("cycle", "kmeans_plus_plus")
 ARMS = (Arm("random", "top"), DEFAULT, Arm("oracle", "top"), Arm("self_inverse", "kmeans_plus_plus"))
 
@@ -50,11 +52,22 @@ class ArmRun:
     def results(self) -> Json:
         """After every round: model error on each test, rank correlations, what was picked."""
         data = self.rooms.load()
-        experiment = Experiment(
+        rounds = [_told(self.arm, found, data) for found in self._experiment(data).rounds()]
+        return {"arm": self.arm.name, "seed": self.seed, "rounds": rounds}
+
+    def _experiment(self, data: Data) -> Experiment:
+        """In explore mode with the simulator's states, at which nobody but the labeler looks."""
+        plain = Experiment(
             self.arm, self.seed, data.spaces, data.pool, self.networks, seed_set=data.seed_set, video=data.video
         )
-        rounds = [_told(self.arm, found, data) for found in experiment.rounds()]
-        return {"arm": self.arm.name, "seed": self.seed, "rounds": rounds}
+        if self.arm.strategy not in EXPLORERS:
+            return plain
+        if self.rooms.pool is not None:
+            raise ValueError(f"Arm {self.arm.name} acts in the simulator, of which {self.rooms.pool} holds no states.")
+        spec = replace(self.rooms.pool_spec, states=True)
+        states = tuple(load_states(spec, self.rooms.folder))
+        shared = {field.name: getattr(plain, field.name) for field in fields(plain)}
+        return Exploration(**shared, spec=spec, states=states)
 
 
 def main(argv: Sequence[str] | None = None) -> list[Figure]:
@@ -84,7 +97,7 @@ def _told(arm: Arm, found: Round, data: Data) -> Json:
         told[name] = {group: _short(asdict(each)) for group, each in groups.items()}
     told["inverse_by_action"] = _inverse_by_action(found, data.tests["balanced"])
     told["ranks"] = _ranks(arm, found, data.tests["natural"])
-    told["picks"] = _picks(found, data.pool)
+    told["picks"] = _picks(found)
     if data.outcomes is not None and found.models.world_model is not None:
         told["action_following"] = action_following(found.models.world_model, data.outcomes)
     return told
@@ -128,11 +141,11 @@ def _correlations(score: Tensor, loss: Tensor) -> Json:
     return {"spearman": spearman(score, loss), "kendall": kendall(score, loss)}
 
 
-def _picks(found: Round, pool: SegmentBatch) -> Json:
+def _picks(found: Round) -> Json:
     """What was picked: segments, how many effective ones of each action, and their true losses."""
-    if len(found.picks) == 0:
+    chosen = found.chosen
+    if chosen is None:
         return {}
-    chosen = pool.take(found.picks)
     assert chosen.action_sets is not None
     alone = chosen.action_sets[:, 0].sum(1) == 1
     return {

@@ -7,9 +7,12 @@ from torch import Tensor
 
 from models.acquisition import BATCH_RULES, STRATEGIES, BatchRule, Models, Strategy
 from models.acquisition.cycle import Cycle
+from models.acquisition.random import Random
 from models.segments import SegmentBatch
 
-CONTROL = "no_score"
+CONTROL, EXPLORE, CHANCE = "no_score", "explore", "explore_random"
+EXPLORERS = (EXPLORE, CHANCE)
+"""Arms in explore mode: what is labeled is executed by the labeler, not found in the pool."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,19 @@ class NoScore(Cycle):
         return torch.rand(batch.size, generator=generator)
 
 
-ALL: dict[str, Strategy] = {**STRATEGIES, CONTROL: NoScore()}
+@dataclass(frozen=True)
+class Explore(Cycle):
+    """`cycle` in explore mode."""
+
+    name: str = EXPLORE
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """The cycle's networks and the subgoal generator."""
+        return super().needs | {"subgoal_generator"}
+
+
+ALL: dict[str, Strategy] = {**STRATEGIES, CONTROL: NoScore(), EXPLORE: Explore(), CHANCE: Random(CHANCE)}
 
 
 @dataclass(frozen=True)

@@ -42,13 +42,18 @@ class Plan:
 
 @dataclass(frozen=True)
 class Round:
-    """What a round is after its training: labels so far, networks, and what is then picked (rows of the pool)."""
+    """What a round is after its training: labels so far, networks, and what is then picked and labeled.
+
+    picks: rows of the pool, those that were explored from in explore mode. chosen: what came of them, labeled; None
+    after the last round.
+    """
 
     number: int
     labeled: SegmentBatch
     models: Models
     picks: Tensor
-    scores: Tensor  # (N,) of the whole pool
+    scores: Tensor  # (N,) of the whole pool; none in explore mode
+    chosen: SegmentBatch | None
 
 
 @dataclass(frozen=True)
@@ -73,19 +78,19 @@ class Experiment:
         rng = np.random.default_rng(self.seed)  # of the labeling worker
         free = torch.ones(self.pool.size, dtype=torch.bool)
         labeled, previous = list[SegmentBatch](), None
-        if self.seed_set is not None:
-            labeled.append(self.seed_set)
         picks = self._first_picks()
+        chosen = self.seed_set or draw_labels(self.pool.take(picks), rng)
         for number in range(1, self.plan.batches + 2):
+            labeled.append(chosen)
             free[picks] = False
-            if len(picks):
-                labeled.append(draw_labels(self.pool.take(picks), rng))
             everything = concatenate(labeled)
             models = replace(self._trained(number, everything), previous_world_model=previous)
             scores = self._scores(number, models)
-            last = number == self.plan.batches + 1
-            picks = torch.zeros(0, dtype=torch.int64) if last else self._picks(number, models, scores, free)
-            yield Round(number, everything, models, picks, scores)
+            if number > self.plan.batches:
+                yield Round(number, everything, models, torch.zeros(0, dtype=torch.int64), scores, None)
+                return
+            picks, chosen = self._chosen(number, models, scores, free, rng)
+            yield Round(number, everything, models, picks, scores, chosen)
             previous = models.world_model
 
     @property
@@ -136,6 +141,13 @@ class Experiment:
         if strategy.privileged:  # never scored by the service; some need the whole pool at once
             return score_pool(strategy, models, draw_labels(seen, np.random.default_rng(self.seed)), generator).float()
         return torch.cat([score_pool(strategy, models, part, generator) for part in parts_of(seen)]).float()
+
+    def _chosen(
+        self, number: int, models: Models, scores: Tensor, free: Tensor, rng: np.random.Generator
+    ) -> tuple[Tensor, SegmentBatch]:
+        """The next rows of the pool, and their labels."""
+        picks = self._picks(number, models, scores, free)
+        return picks, draw_labels(self.pool.take(picks), rng)
 
     def _picks(self, number: int, models: Models, scores: Tensor, free: Tensor) -> Tensor:
         ranked = top(scores, len(scores))

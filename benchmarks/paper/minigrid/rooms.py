@@ -74,6 +74,11 @@ class Rooms:
         """From files, made where they are not there yet."""
         return _load(self)
 
+    @property
+    def pool_spec(self) -> DataSpec:
+        """What the project's own pool is made of."""
+        return self.spec(1, "mixture", self.pool_transitions)
+
     def spec(self, number: int, behavior: str, transitions: int, per_action: int = 0) -> DataSpec:
         """Set `number` of these rooms."""
         first = (TUNING if self.tuning else REPORTED) + 10 * self.data_seed
@@ -90,7 +95,7 @@ def add_files(parser: argparse.ArgumentParser) -> None:
 @cache
 def _load(rooms: Rooms) -> Data:
     """Once a process."""
-    pool = _foreign(rooms.pool) or load(rooms.spec(1, "mixture", rooms.pool_transitions), rooms.folder)
+    pool = _foreign(rooms.pool) or load(rooms.pool_spec, rooms.folder)
     ours = rooms.pool is None and rooms.test_set is None
     outcomes = load_outcomes(rooms.spec(4, "balanced", 200_000, per_action=100), rooms.folder) if ours else None
     return Data(pool, _tests(rooms), _foreign(rooms.seed_set), _foreign(rooms.video), outcomes)

@@ -87,11 +87,12 @@ def describe(
         actions = strategy.actions(needed, part)
         if actions is None:
             return Candidates(scores)
-        parts.append(_description(rule.reads, world_model, part, actions))
+        parts.append(description(rule.reads, world_model, part, actions))
     return Candidates(scores, **{rule.reads: torch.cat(parts).cpu()})
 
 
-def _description(reads: Description, world_model: WorldModel, batch: SegmentBatch, actions: Tensor) -> Tensor:
+def description(reads: Description, world_model: WorldModel, batch: SegmentBatch, actions: Tensor) -> Tensor:
+    """What a rule reads of segments, observed or imagined, under actions (B, L): a row each."""
     if reads == "signatures":
         return world_model.signatures(batch.observations, actions)
     return world_model.latent_features(batch.observations, actions)

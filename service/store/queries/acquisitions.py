@@ -47,18 +47,24 @@ STILL_FREE = select(QueueRow.rank).where(FREE, QueueRow.rank.between(bindparam("
 
 
 def newest_scoring(
-    session: Session, project_id: UUID, strategy: str, round_id: UUID | None, status: str | None = None
+    session: Session,
+    project_id: UUID,
+    strategy: str,
+    round_id: UUID | None,
+    status: str | None = None,
+    mode: str = "pool",
 ) -> ScoringRow | None:
     """The youngest scoring of a strategy under a round that has not failed, or that has this status."""
-    statement = _scorings(project_id, strategy, round_id)
+    statement = _scorings(project_id, strategy, round_id, mode)
     wanted = ScoringRow.status != "failed" if status is None else ScoringRow.status == status
     return session.scalar(statement.where(wanted).limit(1))
 
 
-def _scorings(project_id: UUID, strategy: str, round_id: UUID | None) -> Select[ScoringRow]:
+def _scorings(project_id: UUID, strategy: str, round_id: UUID | None, mode: str = "pool") -> Select[ScoringRow]:
     """Youngest first."""
     statement = select(ScoringRow).where(
         ScoringRow.project_id == project_id,
+        ScoringRow.mode == mode,
         ScoringRow.strategy == strategy,
         ScoringRow.round_id == round_id if round_id else ScoringRow.round_id.is_(None),
     )
@@ -101,6 +107,19 @@ def still_free(session: Session, scoring: ScoringRow, rows: Sequence[Queued], no
         return set()
     asked = {"scoring": scoring.id, "now": now, "first": rows[0].rank, "last": rows[-1].rank}
     return set(session.scalars(STILL_FREE, asked))
+
+
+def explorations(session: Session, scoring: ScoringRow, count: int) -> Sequence[QueueRow]:
+    """The best `count` of what a scoring proposes to execute. Each is given out once: who takes them drops them."""
+    statement = select(QueueRow).where(QueueRow.scoring_id == scoring.id).order_by(QueueRow.rank).limit(count)
+    return session.scalars(statement).all()
+
+
+def drop_explorations(session: Session, scoring: ScoringRow, ranks: Sequence[int]) -> None:
+    """They are given out: nobody is offered them again."""
+    for i in range(0, len(ranks), 500):
+        where = (QueueRow.scoring_id == scoring.id, QueueRow.rank.in_(ranks[i : i + 500]))
+        session.execute(delete(QueueRow).where(*where).execution_options(synchronize_session=False))
 
 
 def add_items(session: Session, items: Sequence[Mapping[str, object]]) -> None:
@@ -192,9 +211,9 @@ def _label_of_item() -> ColumnElement[bool]:
 
 def drop_from_queues(session: Session, project_id: UUID, segments: Sequence[Segment]) -> None:
     """Labeled segments are in no queue. Rows that an acquisition reads at this moment stay: to wait for it could be to
-    wait for ourselves, and what is labeled is passed over there anyway."""
+    wait for ourselves, and what is labeled is passed over there anyway. What began there can still be explored."""
     for some in parts(segments):
-        named = among(session, QueueRow.trajectory_id, QueueRow.start, some)
+        named = and_(among(session, QueueRow.trajectory_id, QueueRow.start, some), QueueRow.actions.is_(None))
         rows = select(QueueRow.scoring_id, QueueRow.rank).where(QueueRow.project_id == project_id, named)
         gone = tuple_(QueueRow.scoring_id, QueueRow.rank).in_(rows.with_for_update(skip_locked=True))
         session.execute(delete(QueueRow).where(gone).execution_options(synchronize_session=False))
@@ -221,6 +240,7 @@ def replace_queue(session: Session, scoring: ScoringRow, rows: Sequence[QueueRow
     """The queue of a scoring becomes `rows`; queues of the same strategy's older scorings go."""
     older = select(ScoringRow.id).where(
         ScoringRow.project_id == scoring.project_id,
+        ScoringRow.mode == scoring.mode,
         ScoringRow.strategy == scoring.strategy,
         ScoringRow.created_at < scoring.created_at,
     )

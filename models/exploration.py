@@ -1,0 +1,190 @@
+"""Explore mode: Algorithm 1 with the two checks of section 2.2, as a score of every action at every state.
+
+Algorithm 1 executes along the sampled chain with the largest cycle error. What has the largest is often a chain that
+the generator gets wrong: no action leads there. So no chain is believed by itself. At a state x_t, with futures x~_m of
+prior p_m and predictions x^_a = f(z_t, a) of every action, executing a is worth
+
+    fidelity        -log sum_m w_ma exp(-l(x^_a, x~_m)),   w_ma ~ p_m h(a | x_t, x~_m), summing to 1 over m,
+  + cycle error     max_m min_b l(x^_b, x~_m) sqrt(q_ma), over the futures that the generator stands by,
+    reachability    q_ma ~ sqrt(h(a | x_t, x~_m)) (1 - h(a | x_t, x^_a)) (1 - p(x^_a)^3) / h(a), summing to 1 over a.
+
+The first is large where what the world model says of a is no plausible outcome of it; one wrong future more only lowers
+it. The second is large where something may happen that the world model expects of no action: one of those led there
+that the inverse dynamics names for it, does not recognise in what the world model expects of them, and of which the
+world model is not sure: p(x^_a) is what it gives to its likeliest prediction. h(a) is how often a is inferred at all.
+Without it an action that few labels show is never inferred, so never executed, so never labeled.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from models.acquisition.base import CHUNK, Models, given, require
+from models.acquisition.batch_rules import BatchRule, Candidates, top
+from models.acquisition.batch_rules.base import description
+from models.acquisition.cycle import Cycle
+from models.acquisition.reachability import predicted_chain
+from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.segments import Observations, SegmentBatch, future
+from models.subgoal_generators.base import Futures
+from models.world_models.base import WorldModel
+
+STATES = 4000
+"""Drawn of the pool each time: what is worth executing is at many states, so looking at more of them hardly helps."""
+
+DOUBT = 0.01  # no action is known so well that it leads nowhere else
+RARE = 1e-3  # an action that is inferred less often than this counts as inferred so often
+SHARPNESS = 3.0  # a prediction is sure where it leaves out less than about a third of a nat
+
+
+@dataclass(frozen=True)
+class Explorations:
+    """M of them. states int64 (M,): the rows they begin at. actions int64 (M, K): to be executed. scores (M,), nats."""
+
+    states: Tensor
+    actions: Tensor
+    scores: Tensor
+
+
+@torch.inference_mode()
+def explore(
+    strategy: Cycle,
+    models: Models,
+    observations: Observations,
+    horizon: int,
+    generator: torch.Generator,
+    chunk: int = CHUNK,
+    after_each: Callable[[], None] = lambda: None,
+) -> Explorations:
+    """All actions at states x_t (B, ...), each followed by what is inferred along its likeliest future, and scored.
+
+    The strategy says whose inverse dynamics infers. after_each: called after each chunk of states, may raise to stop.
+    Raises ValueError when `models` lacks what the strategy needs or a subgoal generator.
+    """
+    require(strategy, models)
+    subgoals = given(strategy, "subgoal_generator", models.subgoal_generator)
+    world_model, inverse = given(strategy, "world_model", models.world_model), strategy.verifier(models)
+    parts = list[_Imagined]()
+    for start in range(0, len(next(iter(observations.values()))), chunk):
+        states = {name: stream[start : start + chunk] for name, stream in observations.items()}
+        futures = subgoals.futures(states, horizon, generator)
+        parts.append(_Imagined(states, futures, inverse.log_prob(SegmentBatch(futures.chains))))
+        after_each()
+    usual = torch.cat([part.log_prob[:, 0].exp() for part in parts]).mean(0)
+    actions, scores = list[Tensor](), list[Tensor]()
+    for part in parts:
+        actions.append(_candidates(part))
+        scores.append(_scores(world_model, inverse, part, actions[-1], usual))
+        after_each()
+    return _listed(torch.cat(actions), torch.cat(scores))
+
+
+@torch.inference_mode()
+def order(
+    rule: BatchRule,
+    models: Models,
+    observations: Observations,
+    found: Explorations,
+    count: int,
+    generator: torch.Generator,
+    chunk: int = CHUNK,
+) -> Tensor:
+    """Rows of `found` that have the `count` highest scores, so ordered that every prefix is a good batch.
+
+    observations: the states (B, ...) that `explore` was given.
+    """
+    best = top(found.scores, count)
+    world_model = models.world_model
+    candidates = Candidates(found.scores[best])
+    if rule.reads is not None and world_model is not None and len(best):
+        parts = []
+        for start in range(0, len(best), chunk):
+            rows = best[start : start + chunk]
+            states = {name: stream[found.states[rows]].unsqueeze(1) for name, stream in observations.items()}
+            chain = SegmentBatch(predicted_chain(world_model, states, found.actions[rows]))
+            parts.append(description(rule.reads, world_model, chain, found.actions[rows]))
+        candidates = Candidates(found.scores[best], **{rule.reads: torch.cat(parts).cpu()})
+    return best[rule.order(candidates, len(best), generator)]
+
+
+@dataclass(frozen=True)
+class _Imagined:
+    """States (B, ...), their M futures, and h of every action along each: (M, K, n)."""
+
+    states: Observations
+    futures: Futures
+    log_prob: Tensor
+
+    @property
+    def size(self) -> int:
+        """B."""
+        return len(next(iter(self.states.values())))
+
+
+def _candidates(imagined: _Imagined) -> Tensor:
+    """Actions (B, n, K): first each of the n, then those inferred along the future in which it is likeliest first."""
+    log_prob, futures = imagined.log_prob, imagined.futures
+    likeliest = _per_state(log_prob[:, 0], futures.states, imagined.size)
+    best = (log_prob[:, 0] == likeliest[futures.states]).nonzero()  # (any, 2): future, action
+    shape = (imagined.size, log_prob.shape[2], log_prob.shape[1])
+    following = torch.zeros(shape, dtype=torch.int64, device=log_prob.device)
+    following[futures.states[best[:, 0]], best[:, 1]] = log_prob.argmax(-1)[best[:, 0]]
+    following[..., 0] = torch.arange(shape[1], device=log_prob.device)
+    return following
+
+
+def _scores(
+    world_model: WorldModel, inverse: DiscreteInverseDynamics, imagined: _Imagined, actions: Tensor, usual: Tensor
+) -> Tensor:
+    """(B, n) nats of actions (B, n, K). usual (n,): how often each is inferred at all."""
+    count, futures = imagined.size, imagined.futures
+    now = {name: stream.unsqueeze(1) for name, stream in imagined.states.items()}  # (B, 1, ...)
+    state = world_model.infer_state(now)
+    distances, named, unknown = list[Tensor](), list[Tensor](), list[Tensor]()  # a column an action
+    for each in actions.unbind(1):  # (B, K)
+        prediction = world_model.rollout(state, each)
+        distances.append(world_model.distance(prediction[futures.states], future(futures.chains)))
+        named.append(_log_prob(imagined.log_prob, each[futures.states]))
+        unknown.append(_unknown(world_model, inverse, now, each, prediction).log())
+    distance, inferred, rows = torch.stack(distances, 1), torch.stack(named, 1), futures.states  # (M, n)
+    weight = futures.log_prob.unsqueeze(1) + inferred
+    fidelity = _logsumexp(weight, rows, count) - _logsumexp(weight - distance, rows, count)
+    posterior = (0.5 * inferred + torch.stack(unknown, 1)[rows] - (usual + RARE).log()).softmax(1)
+    unexplained = torch.where(futures.steady, distance.amin(1), 0.0).unsqueeze(1)
+    return fidelity + _per_state(unexplained * posterior.sqrt(), rows, count)
+
+
+def _unknown(
+    world_model: WorldModel, inverse: DiscreteInverseDynamics, now: Observations, actions: Tensor, prediction: Tensor
+) -> Tensor:
+    """How little is known of what actions (B, K) do at x_t (B, 1, ...): (B,), in (0, 1.1)."""
+    expected = predicted_chain(world_model, now, actions)
+    recognised = _log_prob(inverse.log_prob(SegmentBatch(expected)), actions).exp()
+    sure = (-SHARPNESS * world_model.distance(prediction, future(expected))).exp()
+    return (1.0 - recognised + DOUBT) * (1.0 - sure + DOUBT)
+
+
+def _listed(actions: Tensor, scores: Tensor) -> Explorations:
+    """(B, n, K), (B, n) -> one row an action, on the CPU."""
+    states = torch.arange(len(actions)).repeat_interleave(actions.shape[1])
+    return Explorations(states, actions.flatten(0, 1).cpu(), scores.flatten().cpu())
+
+
+def _log_prob(log_prob: Tensor, actions: Tensor) -> Tensor:
+    """Of actions (M, K) under log_prob (M, K, n), summed over the steps: (M,)."""
+    return log_prob.gather(-1, actions.unsqueeze(-1)).squeeze(-1).sum(1)
+
+
+def _per_state(values: Tensor, states: Tensor, count: int) -> Tensor:
+    """The largest of each state's values: (M, n) of states (M,) -> (B, n)."""
+    index = states.unsqueeze(1).expand_as(values)
+    return values.new_full((count, values.shape[1]), -torch.inf).scatter_reduce(0, index, values, "amax")
+
+
+def _logsumexp(values: Tensor, states: Tensor, count: int) -> Tensor:
+    """(M, n) of states (M,) -> (B, n)."""
+    largest = _per_state(values, states, count)
+    terms = (values - largest[states]).exp()
+    return largest + torch.zeros_like(largest).index_add_(0, states, terms).log()

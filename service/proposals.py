@@ -1,0 +1,94 @@
+"""Proposals: explorations that a strategy chooses under the current round's models, kept ready in a queue of their own.
+
+They come of a scoring in mode `explore`: one job draws states of the pool, imagines futures there and queues what is
+most worth executing. Each is given out once; when all are, the job runs again and draws other states.
+"""
+
+from collections.abc import Sequence
+from datetime import datetime
+
+from sqlalchemy.orm import Session
+
+from api_schemas.jobs import ProposeExplorations, TrainRound
+from api_schemas.strategies import CATALOG
+from service import draws, jobs, projects, scorings
+from service.errors import NothingToExplore
+from service.scorings import NEEDS, PREVIOUS, Limits
+from service.store.queries import acquisitions as queries
+from service.store.queries import jobs as job_queries
+from service.store.queries import pool as pool_queries
+from service.store.queries import rounds as round_queries
+from service.store.tables import JobRow, ModelVersionRow, ProjectRow, QueueRow, RoundRow, ScoringRow
+
+EXPLORING = frozenset(strategy.name for strategy in CATALOG if strategy.explores)
+GENERATOR = "subgoal_generator"
+
+
+def proposing(session: Session, project: ProjectRow, strategy: str) -> RoundRow | None:
+    """The round under whose models the strategy proposes; None where there is only chance.
+
+    That is so for a strategy that does not explore, before the first round, and until a subgoal generator is trained.
+    """
+    current = round_queries.current_round(session, project.id) if strategy in EXPLORING else None
+    return current if current is not None and generator_of(session, current) is not None else None
+
+
+def generator_of(session: Session, round_row: RoundRow) -> ModelVersionRow | None:
+    """The subgoal generator that proposes in a round: its own where its strategy has one, else the project's newest."""
+    own = (model for model in round_queries.models_of(session, round_row.id) if model.kind == GENERATOR)
+    return next(own, None) or round_queries.newest_model(session, round_row.project_id, GENERATOR)
+
+
+def take(
+    session: Session, project: ProjectRow, strategy: str, round_row: RoundRow, count: int, now: datetime, limits: Limits
+) -> tuple[ScoringRow, Sequence[QueueRow]] | JobRow:
+    """The best `count` proposals, or as many as are left, which are then nobody else's; or the job that makes some.
+
+    Call it under the project's lock. Raises NothingToExplore where no state of the pool can be gone back to.
+    """
+    scoring = queries.newest_scoring(session, project.id, strategy, round_row.id, mode="explore")
+    if scoring is None:
+        return _request(session, project, strategy, round_row, count, now, limits)
+    scoring = scorings.find(session, scoring.id, lock=True)  # no job replaces the queue between reading and dropping
+    found = queries.explorations(session, scoring, count) if scoring.status == "ready" else []
+    if not found:
+        return _propose(session, project, scoring, count, now, limits)
+    queries.drop_explorations(session, scoring, [row.rank for row in found])
+    return scoring, found
+
+
+def _request(
+    session: Session, project: ProjectRow, strategy: str, round_row: RoundRow, count: int, now: datetime, limits: Limits
+) -> JobRow:
+    """The first proposals of a round; networks that only this strategy needs are trained before."""
+    have = {model.kind for model in round_queries.models_of(session, round_row.id)}
+    if not NEEDS[strategy] - {PREVIOUS, GENERATOR} <= have:
+        waiting = job_queries.unfinished(session, round_row.id)
+        training = TrainRound.model_validate({"round": round_row.id, "strategy": strategy})
+        return waiting or jobs.enqueue(session, project.id, training, round_row.id, now, limits.max_attempts)
+    scoring = ScoringRow(
+        project_id=project.id,
+        round_id=round_row.id,
+        mode="explore",
+        strategy=strategy,
+        status="scoring",
+        memberships=pool_queries.newest_membership(session, project.id, "pool"),
+        shards=0,
+        created_at=now,
+    )
+    session.add(scoring)
+    session.flush()
+    scorings.tell(session, scoring, "started", now)
+    return _propose(session, project, scoring, count, now, limits)
+
+
+def _propose(
+    session: Session, project: ProjectRow, scoring: ScoringRow, count: int, now: datetime, limits: Limits
+) -> JobRow:
+    waiting = job_queries.unfinished(session, scoring.id)
+    if waiting is not None:
+        return waiting
+    if not draws.states(session, project).count:
+        raise NothingToExplore(project.id, projects.environment_of(project).simulator)
+    payload = ProposeExplorations(scoring=scoring.id, length=max(limits.queue_length, count))
+    return jobs.enqueue(session, project.id, payload, scoring.id, now, limits.max_attempts)

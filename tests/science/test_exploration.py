@@ -1,0 +1,146 @@
+"""Explore mode: what to execute where, from imagined futures alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from models.acquisition import BATCH_RULES, EXPLORING, Models
+from models.exploration import Explorations, explore, order
+from models.families import GRID
+from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.segments import Observations, at
+from models.subgoal_generators.grid import GridSubgoalGenerator
+from models.training import TrainingConfig, train
+from models.world_models.grid import GridWorldModel
+from tests.science import toy_grid
+
+CYCLE = EXPLORING["cycle"]
+STATES = 300
+
+
+@pytest.fixture(scope="module")
+def subgoal_generator() -> GridSubgoalGenerator:
+    """Has seen what follows in 3,000 toy transitions, and no action."""
+    generator = torch.Generator().manual_seed(2)
+    model = GRID.build_subgoal_generator(toy_grid.SPACES, None, generator)
+    seen = toy_grid.labeled(3000, seed=3).without_labels()
+    train(model, seen, TrainingConfig(400, 64, 5e-3, 1e-4), generator)
+    return model
+
+
+@pytest.fixture(scope="module")
+def models(
+    world_model: GridWorldModel,
+    inverse_dynamics: DiscreteInverseDynamics,
+    subgoal_generator: GridSubgoalGenerator,
+) -> Models:
+    """A world model that knows movement only, inverse dynamics that knows all seven actions, and the generator."""
+    return Models(world_model, inverse_dynamics, subgoal_generator=subgoal_generator)
+
+
+@pytest.fixture(scope="module")
+def states() -> Observations:
+    """Of rooms that nobody has seen."""
+    return at(toy_grid.labeled(STATES, seed=8).observations, 0)
+
+
+@pytest.fixture(scope="module")
+def found(models: Models, states: Observations) -> Explorations:
+    """All actions at all of them."""
+    return explore(CYCLE, models, states, 1, torch.Generator())
+
+
+def outcomes(found: Explorations, states: Observations) -> Observations:
+    """What executing leads to: (M, ...)."""
+    grid, carried = (states[name][found.states].numpy() for name in ("grid", "carried"))
+    after = toy_grid.step(grid, carried, found.actions[:, 0].numpy())
+    return {"grid": torch.from_numpy(after[0]), "carried": torch.from_numpy(after[1])}
+
+
+@torch.inference_mode()
+def true_loss(
+    world_model: GridWorldModel, found: Explorations, states: Observations, after: Observations
+) -> torch.Tensor:
+    """Of the world model, on what it would be shown: nats (M,)."""
+    state = world_model.encode({name: stream[found.states] for name, stream in states.items()})
+    following = {name: stream.unsqueeze(1) for name, stream in after.items()}
+    return world_model.distance(world_model.rollout(state, found.actions), following)
+
+
+def test_every_action_is_scored_at_every_state(found: Explorations) -> None:
+    pairs = set(zip(found.states.tolist(), found.actions[:, 0].tolist(), strict=True))
+    assert pairs == {(state, action) for state in range(STATES) for action in range(toy_grid.ACTIONS)}
+    assert len(found.scores) == len(pairs)
+    assert bool(torch.isfinite(found.scores).all())
+
+
+def test_worth_executing_is_what_the_world_model_does_not_know(
+    found: Explorations, states: Observations, world_model: GridWorldModel
+) -> None:
+    after = outcomes(found, states)
+    works = ~_same(after, {name: stream[found.states] for name, stream in states.items()})
+    loss = true_loss(world_model, found, states, after)
+    interaction = found.actions[:, 0] >= 3
+    best = found.scores.argsort(descending=True)[:100]
+    assert float(interaction[best].float().mean()) > 0.95  # movement is all that it has learned
+    assert float((interaction & works)[best].float().mean()) > 2 * float((interaction & works).float().mean())
+    assert float(loss[best].mean()) > 2 * float(loss.mean())
+    assert float(found.scores[interaction & works].median()) > 5 * float(found.scores[~interaction].median())
+
+
+def test_scores_do_not_depend_on_how_states_are_cut(models: Models, states: Observations, found: Explorations) -> None:
+    again = explore(CYCLE, models, states, 1, torch.Generator(), chunk=41)
+    assert torch.equal(again.actions, found.actions)
+    torch.testing.assert_close(again.scores, found.scores, rtol=1e-3, atol=1e-3)
+
+
+def test_several_steps_go_on_as_is_inferred_along_a_future(models: Models, states: Observations) -> None:
+    some = {name: stream[:20] for name, stream in states.items()}
+    left, right = (explore(CYCLE, models, some, 3, torch.Generator().manual_seed(6)) for _ in range(2))
+    assert left.actions.shape == (20 * toy_grid.ACTIONS, 3)
+    assert left.actions[:, 0].tolist() == list(range(toy_grid.ACTIONS)) * 20
+    assert torch.equal(left.actions, right.actions)
+    assert torch.equal(left.scores, right.scores)
+    assert bool(torch.isfinite(left.scores).all())
+
+
+@pytest.mark.parametrize("rule", BATCH_RULES)
+def test_a_batch_rule_orders_the_best(rule: str, models: Models, states: Observations, found: Explorations) -> None:
+    rows = order(BATCH_RULES[rule], models, states, found, 50, torch.Generator().manual_seed(0))
+    assert len(rows) == len(set(rows.tolist())) == 50
+    assert float(found.scores[rows].min()) >= float(found.scores.sort(descending=True).values[49])
+
+
+def test_without_a_subgoal_generator_nothing_is_explored(models: Models, states: Observations) -> None:
+    with pytest.raises(ValueError, match="cycle needs subgoal_generator"):
+        explore(CYCLE, replace(models, subgoal_generator=None), states, 1, torch.Generator())
+
+
+def test_futures_hold_what_is_rare_and_that_nothing_happens(subgoal_generator: GridSubgoalGenerator) -> None:
+    batch = toy_grid.labeled(300, seed=12, effective=True)
+    futures = subgoal_generator.futures(at(batch.observations, 0), 1, torch.Generator())
+    assert set(futures.states.tolist()) == set(range(300))
+    after = {name: batch.observations[name][futures.states, 1] for name in batch.observations}
+    now = {name: batch.observations[name][futures.states, 0] for name in batch.observations}
+    came = _same({name: chain[:, 1] for name, chain in futures.chains.items()}, after)
+    still = _same({name: chain[:, 1] for name, chain in futures.chains.items()}, now)
+    assert len(set(futures.states[came].tolist())) > 0.6 * 300  # samples of it would mostly be movements
+    assert set(futures.states[still].tolist()) == set(range(300))
+    unreachable = ~_reachable(futures.chains)
+    assert float(unreachable[futures.steady].float().mean()) < float(unreachable[~futures.steady].float().mean())
+
+
+def _same(left: Observations, right: Observations) -> torch.Tensor:
+    return torch.stack([(left[name] == right[name]).flatten(1).all(1) for name in left]).all(0)
+
+
+def _reachable(chains: Observations) -> torch.Tensor:
+    """Whether any action leads there."""
+    grid, carried = chains["grid"].numpy(), chains["carried"].numpy()
+    outcomes = [
+        toy_grid.step(grid[:, 0], carried[:, 0], np.full(len(grid), action)) for action in range(toy_grid.ACTIONS)
+    ]
+    reached = [(a == grid[:, 1]).all((1, 2, 3)) & (b == carried[:, 1]).all(1) for a, b in outcomes]
+    return torch.from_numpy(np.stack(reached).any(0))

@@ -1,0 +1,165 @@
+"""Explore mode over HTTP: what a strategy proposes is given out once, executed as asked, and comes back labeled."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pytest
+import torch
+
+from api_schemas.acquisitions import Acquisition
+from asim.errors import NotReady
+from models import checkpoints
+from models.acquisition import EXPLORING, STRATEGIES
+from models.exploration import explore
+from models.segments import at
+from models.subgoal_generators.base import SubgoalGenerator
+from service.store.queries import pool as pool_queries
+from service.store.tables import ProjectRow, QueueRow, ScoringRow
+from tests.workers.conftest import OpenLoop
+from tests.workers.in_process import Loop
+from workers import data, scoring
+from workers.dispatch import run_next
+from workers.labeling import run_labeling
+
+Proposal = tuple[str, int, tuple[object, ...]]
+
+
+def proposals(batch: Acquisition) -> list[Proposal]:
+    """State and actions of each item, by rank."""
+    return [(item.trajectory, item.start, tuple(item.actions or ())) for item in batch.items]
+
+
+def queued(loop: Loop) -> list[tuple[Proposal, float | None]]:
+    """What explore mode would give out next, best first."""
+    with loop.worker.database.read() as session:
+        rows = session.query(QueueRow).join(ScoringRow, ScoringRow.id == QueueRow.scoring_id)
+        rows = rows.filter(ScoringRow.mode == "explore").order_by(QueueRow.rank)
+        return [((row.trajectory_id, row.start, tuple(row.actions or ())), row.score) for row in rows]
+
+
+def test_a_strategy_proposes_under_the_rounds_models(trained: Loop) -> None:
+    with pytest.raises(NotReady):
+        trained.client.acquire(trained.project.id, 5, mode="explore", wait=0)
+    (job,) = trained.jobs("propose_explorations")
+    assert (job.state, job.queue) == ("queued", "score")
+    batch = trained.acquire(5, mode="explore")
+    assert (batch.mode, batch.strategy, batch.requested_strategy) == ("explore", "cycle", "cycle")
+    assert (batch.round, batch.reason) == (trained.project.current_round, None)
+    assert [len(item.actions or ()) for item in batch.items] == [1] * 5
+    assert trained.project.counts.leased == 0  # no segment is claimed
+    assert trained.project.counts.unlabeled == 540
+
+
+def test_proposals_have_the_scores_of_the_strategy_on_the_rounds_networks(trained: Loop) -> None:
+    with pytest.raises(NotReady):
+        trained.client.acquire(trained.project.id, 1, mode="explore", wait=0)
+    trained.drain()
+    with trained.worker.database.read() as session:
+        project = session.get_one(ProjectRow, trained.project.id)
+        windows = data.windows_of(session, project, pool_queries.memberships(session, project.id, "pool"), None)
+    needs = STRATEGIES["cycle"].needs
+    models = scoring.load_models(trained.worker.database, trained.blobs, project, trained.project.current_round, needs)
+    (generator,) = (m for m in trained.client.models(project.id) if m.kind == "subgoal_generator")
+    subgoals = checkpoints.load(trained.blobs.get("weights", generator.sha256))
+    models = replace(models, subgoal_generator=cast(SubgoalGenerator, subgoals))
+    batch = data.load(trained.blobs, windows, 1)
+    found = explore(EXPLORING["cycle"], models, at(batch.observations, 0), 1, torch.Generator())
+    names = [batch.segments[int(row)] for row in found.states]
+    direct = {
+        (name.trajectory, name.start, tuple(actions)): score
+        for name, actions, score in zip(names, found.actions.tolist(), found.scores.tolist(), strict=True)
+    }
+    assert len(direct) == 600 * 7
+    ranked = queued(trained)
+    assert len(ranked) == min(len(direct), trained.settings.queue_length)
+    expected = [direct[key] for key, _ in ranked]
+    np.testing.assert_allclose([score or 0.0 for _, score in ranked], expected, rtol=1e-3, atol=1e-3)
+
+
+def test_a_proposal_is_given_out_once_and_others_follow(opened: OpenLoop, trained_folder: Path) -> None:
+    trained = opened(trained_folder, queue_length=30)
+    first, second = trained.acquire(20, mode="explore"), trained.acquire(20, mode="explore")
+    assert len(first.items) == 20
+    assert len(second.items) == 10
+    assert second.reason == "20 were asked for, 10 explorations were ready"
+    assert len({*proposals(first), *proposals(second)}) == 30
+    assert len(trained.jobs("propose_explorations")) == 1
+    trained.client.release(first.id, first.token or 0)
+    third = trained.acquire(20, mode="explore")  # what was given back is not offered again
+    assert len(trained.jobs("propose_explorations")) == 2
+    assert len(third.items) == 20
+
+
+def test_the_labeling_worker_executes_what_is_proposed(trained: Loop) -> None:
+    batch = trained.acquire(12, mode="explore")
+    before = trained.project.counts.labeled
+    run_labeling(trained.client, batch, np.random.default_rng(0))
+    assert trained.project.counts.labeled == before + 12
+    assert trained.client.acquisition(batch.id).status == "labeled"
+    labels = [label for label in trained.client.labels(trained.project.id) if label.acquisition == batch.id]
+    for item, label in zip(batch.items, labels, strict=True):
+        assert label.actions == item.actions
+        came = trained.client.trajectory_content(trained.project.id, label.trajectory)
+        asked = trained.client.trajectory_content(trained.project.id, item.trajectory, item.start, 1)
+        assert all(np.array_equal(came[name][0], asked[name][0]) for name in asked)
+    trained.train()
+    assert trained.acquire(3, mode="explore").round == trained.project.current_round
+
+
+def test_where_no_model_can_propose_chance_does_and_says_so(trained: Loop) -> None:
+    for strategy in ("random", "uncertainty"):
+        batch = trained.acquire(4, strategy, mode="explore")
+        assert (batch.strategy, batch.requested_strategy, batch.round) == ("random", strategy, None)
+    assert not trained.jobs("propose_explorations")
+
+
+def test_until_a_subgoal_generator_is_trained_chance_explores(labeled: Loop) -> None:
+    asked = labeled.client.start_round(labeled.project.id)
+    while labeled.client.round(asked.id).status != "current":
+        run_next(labeled.worker)
+    assert labeled.acquire(4, mode="explore").strategy == "random"
+    labeled.drain()
+    assert labeled.acquire(4, mode="explore").strategy == "cycle"
+
+
+def test_another_strategys_networks_are_trained_before_it_proposes(trained: Loop) -> None:
+    with pytest.raises(NotReady):
+        trained.client.acquire(trained.project.id, 2, strategy="vanilla_cycle", mode="explore", wait=0)
+    assert trained.jobs("train_round")[-1].state == "queued"
+    trained.drain()
+    assert trained.acquire(2, "vanilla_cycle", mode="explore").strategy == "vanilla_cycle"
+
+
+def test_labels_of_the_pool_leave_proposals_and_pool_queues_apart(trained: Loop) -> None:
+    with pytest.raises(NotReady):
+        trained.client.acquire(trained.project.id, 1, mode="explore", wait=0)
+    trained.drain()
+    before = queued(trained)
+    labeled = trained.label(540)  # every segment that is left
+    assert len(labeled.items) == 540
+    assert queued(trained) == before
+
+
+def test_a_job_that_runs_twice_proposes_the_same(trained: Loop) -> None:
+    with pytest.raises(NotReady):
+        trained.client.acquire(trained.project.id, 1, mode="explore", wait=0)
+    trained.drain()
+    before = queued(trained)
+    (job,) = trained.jobs("propose_explorations")
+    with trained.worker.database.read() as session:
+        (row,) = session.query(ScoringRow).filter_by(mode="explore").all()
+    trained.set_row("scoring", row.id, selections=0, status="scoring")  # as if it had crashed before its last write
+    trained.requeue(job.id)
+    trained.drain()
+    assert queued(trained) == before
+
+
+def test_a_cancelled_job_is_asked_for_anew(trained: Loop) -> None:
+    with pytest.raises(NotReady):
+        trained.client.acquire(trained.project.id, 1, mode="explore", wait=0)
+    trained.cancel(trained.jobs("propose_explorations")[0].id)
+    assert trained.client.round(trained.project.current_round or trained.project.id).status == "current"
+    assert trained.acquire(2, mode="explore").strategy == "cycle"
+    assert len(trained.jobs("propose_explorations")) == 2
