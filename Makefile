@@ -25,7 +25,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt scripts/system-packages
 system: ## Debian packages for everything, tests included (as root; otherwise prints the command)
 	scripts/system-packages all
 
-demo: setup ## the whole loop on MiniGrid, cycle beside random, no server needed (SEED=n for another seed)
+demo: setup ## the whole loop on MiniGrid, the default strategy beside random, no server needed (SEED=n for another seed)
 	$(BIN)/asim demo --seed $(SEED)
 
 serve: setup ## the service on ./asim-data at http://127.0.0.1:8000

@@ -1,4 +1,4 @@
-"""The loop on MiniGrid, end to end: two projects with the same data and seeds, one by cycle, one by random."""
+"""The loop on MiniGrid, end to end: two projects of one seed, one by the default strategy and one by random."""
 
 import json
 import tempfile
@@ -17,7 +17,7 @@ from api_schemas.collections import CollectionCreate, CollectionLabels
 from api_schemas.environments import Environment
 from api_schemas.projects import LabelingPolicy, ProjectCreate, ProjectPatch
 from api_schemas.rounds import ModelErrorCurve
-from api_schemas.strategies import StrategyName
+from api_schemas.strategies import DEFAULT_STRATEGY, StrategyName
 from asim.client import Client
 from asim.errors import AsimError
 from asim.figure import draw_learning_curves
@@ -27,7 +27,7 @@ from asim.served import served
 from asim.tables import error_table
 from workers.labeling import run_labeling
 
-STRATEGIES: tuple[StrategyName, ...] = ("cycle", "random")
+STRATEGIES: tuple[StrategyName, ...] = (DEFAULT_STRATEGY, "random")
 ENVIRONMENT = Environment(simulator="minigrid", options={"task": "any", "room_size": 6, "objects": 3})
 HELD_OUT_SEED = 1_000_000  # added to the demo's seed, so that no test layout is drawn like a pool layout
 QUEUE_SECONDS = 600.0  # longest wait for a ranked queue
@@ -180,12 +180,12 @@ def _write_results(curves: Mapping[str, ModelErrorCurve], picture: Path) -> Path
 
 
 def _verdict(curves: Mapping[str, ModelErrorCurve]) -> str:
-    cycle, random = (curves[strategy].points[-1] for strategy in STRATEGIES)
-    if cycle.model_error.loss is None or random.model_error.loss is None:
+    ours, random = (curves[strategy].points[-1] for strategy in STRATEGIES)
+    if ours.model_error.loss is None or random.model_error.loss is None:
         raise AsimError("the last round has no test loss: the held-out set holds no labeled transition")
-    relation = "below" if cycle.model_error.loss < random.model_error.loss else "not below"
-    numbers = f"{cycle.model_error.loss:.4f} is {relation} random's {random.model_error.loss:.4f}"
-    return f"at {cycle.labels} labels, cycle's test loss {numbers} nats a transition"
+    relation = "below" if ours.model_error.loss < random.model_error.loss else "not below"
+    numbers = f"{ours.model_error.loss:.4f} is {relation} random's {random.model_error.loss:.4f}"
+    return f"at {ours.labels} labels, {DEFAULT_STRATEGY}'s test loss {numbers} nats a transition"
 
 
 @contextmanager

@@ -50,7 +50,7 @@ def demo(
     ] = None,
     key: Key = None,
 ) -> None:
-    """Run the loop on MiniGrid with strategies cycle and random side by side, and compare their model errors."""
+    """Run the loop on MiniGrid with the default strategy and random side by side, and compare their model errors."""
     from asim.demo import Service
     from asim.demo import demo as run_demo
     from asim.errors import AsimError

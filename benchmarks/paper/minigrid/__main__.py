@@ -19,8 +19,8 @@ from typing import Literal
 from benchmarks.figures import Figure, finish
 
 Extent = Literal["quick", "usual", "full"]
-FEW = ("random:top", "oracle:top", "cycle:kmeans_plus_plus", "uncertainty:kmeans_plus_plus")
-MANY_SEEDS = (*FEW, "self_inverse:kmeans_plus_plus")  # the arms with 10 seeds
+FEW = ("random:top", "oracle:top", "confident_cycle:signatures", "uncertainty:signatures")
+MANY_SEEDS = (*FEW, "cycle:signatures", "self_inverse:signatures")  # the arms with 10 seeds
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _arms(extent: Extent) -> list[str]:
     from benchmarks.paper.minigrid.arms import ALL
     from models.acquisition import BATCH_RULES
 
-    rules = list(BATCH_RULES) if extent == "full" else ["top", "kmeans_plus_plus"]
+    rules = list(BATCH_RULES) if extent == "full" else ["top", "signatures"]
     scored = [f"{name}:{rule}" for name in sorted(ALL) if name != "random" for rule in rules]
     return ["random:top", *scored]
 

@@ -1,6 +1,6 @@
 """Figure 4d: what an arm's labels are worth. 200 uniform labels, then batches of 100 chosen by the arm.
 
-    python -m benchmarks.paper.minigrid.acquisition --arms cycle:kmeans_plus_plus random:top --seeds 5
+    python -m benchmarks.paper.minigrid.acquisition --arms confident_cycle:signatures random:top --seeds 5
 
 An arm is `strategy:rule`. All arms get the same pool, seed labels, budgets, schedules and draws.
 """
@@ -31,8 +31,8 @@ MOST_SEEDS = 100
 MOVEMENT = 3  # actions below it are movements
 WITHOUT_RANKS = ("random", "no_score", "oracle_uniform", "fidelity", *EXPLORERS)
 """Their scores are draws, turn on the pool, or are of what was not observed."""
-DEFAULT = Arm("cycle", "kmeans_plus_plus")
-ARMS = (Arm("random", "top"), DEFAULT, Arm("oracle", "top"), Arm("self_inverse", "kmeans_plus_plus"))
+DEFAULT = Arm("confident_cycle", "signatures")
+ARMS = (Arm("random", "top"), DEFAULT, Arm("oracle", "top"), Arm("self_inverse", "signatures"))
 
 
 @dataclass(frozen=True)
