@@ -40,7 +40,9 @@ class AcquireRequest(Schema):
 class AcquisitionItem(Schema):
     """A segment to label: `length` actions from observation `start` on.
 
-    In explore mode, `actions` to execute from observation `start`; the trajectory that comes of it is the answer.
+    confidence: how sure the inverse model was of the actions that it inferred, the product over the steps; None where
+    the strategy infers none. In explore mode, `actions` to execute from observation `start`; the trajectory that comes
+    of it is the answer.
     """
 
     rank: int
@@ -48,6 +50,7 @@ class AcquisitionItem(Schema):
     start: int
     length: int
     score: float | None
+    confidence: float | None = None
     labeled: bool
     actions: list[Action] | None = None
 

@@ -39,11 +39,12 @@ def project_table(projects: Sequence[Project]) -> Table:
 def acquisition_table(acquisition: Acquisition) -> Table:
     """One row a segment, best first; of an exploration, the actions to execute instead of a score."""
     explores = acquisition.mode == "explore"
-    table = _table("rank", "trajectory", "start", "length", "actions" if explores else "score")
+    table = _table("rank", "trajectory", "start", "length", *(("actions",) if explores else ("score", "confidence")))
     for item in acquisition.items:
         score = "" if item.score is None else f"{item.score:.4f}"
-        last = json.dumps(item.actions) if explores else score
-        table.add_row(str(item.rank), item.trajectory, str(item.start), str(item.length), last)
+        confidence = "" if item.confidence is None else f"{item.confidence:.0%}"
+        last = (json.dumps(item.actions),) if explores else (score, confidence)
+        table.add_row(str(item.rank), item.trajectory, str(item.start), str(item.length), *last)
     return table
 
 

@@ -183,7 +183,7 @@ def _draw_ranked(
 
 
 def _ranked(scoring: ScoringRow, rows: Sequence[Queued], room: Room) -> Draw:
-    candidates = [Candidate(row.trajectory, row.start, row.score) for row in rows]
+    candidates = [Candidate(row.trajectory, row.start, row.score, row.confidence) for row in rows]
     return Draw(scoring.strategy, candidates, room.reason, scoring)
 
 
@@ -202,7 +202,7 @@ def _draw_proposals(
         return taken
     scoring, rows = taken
     left = f"{room.count} were asked for, {len(rows)} explorations were ready"
-    candidates = [Candidate(row.trajectory_id, row.start, row.score, _actions(row)) for row in rows]
+    candidates = [Candidate(row.trajectory_id, row.start, row.score, actions=_actions(row)) for row in rows]
     return Draw(strategy, candidates, room.reason if len(rows) == room.count else left, scoring)
 
 
@@ -272,6 +272,7 @@ def _item_row(row: AcquisitionRow, rank: int, candidate: Candidate) -> dict[str,
         "trajectory_id": candidate.trajectory,
         "start": candidate.start,
         "score": candidate.score,
+        "confidence": candidate.confidence,
         "actions": None if candidate.actions is None else list(candidate.actions),
     }
 
@@ -297,6 +298,7 @@ def _item(project: ProjectRow, rank: int, candidate: Candidate) -> AcquisitionIt
         start=candidate.start,
         length=project.segment_length,
         score=candidate.score,
+        confidence=candidate.confidence,
         labeled=False,
         actions=None if candidate.actions is None else list(candidate.actions),
     )
@@ -311,6 +313,7 @@ def _kept_item(project: ProjectRow, row: AcquisitionItemRow, label: UUID | None)
             "start": row.start,
             "length": project.segment_length,
             "score": row.score,
+            "confidence": row.confidence,
             "labeled": row.answer is not None if explores else label is not None,
             "actions": row.actions,
         }

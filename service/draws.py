@@ -22,6 +22,7 @@ class Candidate:
     trajectory: str
     start: int
     score: float | None = None
+    confidence: float | None = None
     actions: Sequence[Action] | None = None
 
 

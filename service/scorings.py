@@ -46,6 +46,7 @@ class Ranked:
     start: int
     score: float
     actions: Sequence[Action] | None = None
+    confidence: float | None = None
 
 
 def ready(session: Session, project: ProjectRow, requested: str) -> ScoringRow | None:
@@ -149,6 +150,7 @@ def publish(session: Session, scoring_id: UUID, ranked: Sequence[Ranked], now: d
             trajectory_id=segment.trajectory,
             start=segment.start,
             score=segment.score,
+            confidence=segment.confidence,
             actions=None if segment.actions is None else list(segment.actions),
         )
         for rank, segment in enumerate(ranked)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 from uuid import UUID
 
 import numpy as np
@@ -13,7 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from api_schemas.jobs import ScoreShard
-from models.acquisition import BATCH_RULES, STRATEGIES, Models, describe, score_pool
+from models.acquisition import BATCH_RULES, STRATEGIES, Models, confidence, describe, score_pool
 from models.chance import scoring_generator
 from service import projects, rounds, scorings
 from service.log import get_logger
@@ -77,10 +78,10 @@ def run_selection(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, o
     pool = _unpack(job.worker.blobs, [sha for sha in shas if sha is not None], job.go_on)
     candidates = _candidates(pool, members, taken, length)
     job.report(0.3, f"selecting from {len(candidates)} candidates")
-    order = _order(job, project, scoring, pool, candidates, members)
+    ordered = _ordered(job, project, scoring, pool, candidates, members)
     ranked = [
-        Ranked(members[int(pool.members[i])].trajectory_id, int(pool.starts[i]), float(pool.scores[i]))
-        for i in candidates[order]
+        Ranked(members[int(pool.members[i])].trajectory_id, int(pool.starts[i]), float(pool.scores[i]), confidence=sure)
+        for i, sure in zip(candidates[ordered.places], ordered.confidence, strict=True)
     ]
     with job.transaction() as session:
         published = scorings.publish(session, scoring.id, ranked, job.now())
@@ -139,21 +140,25 @@ def _scores(
     return torch.cat(parts).float().numpy()
 
 
-def _order(
+class Ordered(NamedTuple):
+    """Places in the candidates, best first, and how sure the strategy's inverse dynamics is there, if it has one."""
+
+    places: NDArray[np.int64]
+    confidence: Sequence[float | None]
+
+
+def _ordered(
     job: RunningJob,
     project: ProjectRow,
     scoring: ScoringRow,
     pool: PoolScores,
     candidates: NDArray[np.int64],
     members: dict[int, MembershipRow],
-) -> NDArray[np.int64]:
-    """Places in `candidates`, best first, as the policy's batch rule has it where the strategy has models.
-
-    The order of a strategy that needs none is a draw already.
-    """
+) -> Ordered:
+    """As the policy's batch rule has it where the strategy has models; else the order is a draw already."""
     rule, strategy = BATCH_RULES[projects.policy_of(project).batch_rule], STRATEGIES[scoring.strategy]
     if not strategy.needs or not len(candidates):
-        return np.arange(len(candidates))
+        return Ordered(np.arange(len(candidates)), [None] * len(candidates))
     with job.worker.database.read() as session:
         windows = _candidate_windows(session, project, pool, candidates, members)
         generator = _generator(session, project, scoring, f"selection {scoring.selections}")
@@ -162,7 +167,8 @@ def _order(
     job.report(0.6, f"ordering {len(candidates)} candidates by {rule.name}")
     described = describe(rule, strategy, models, batch, torch.from_numpy(pool.scores[candidates]))
     order: NDArray[np.int64] = rule.order(described, len(candidates), generator).numpy()
-    return order
+    sure = confidence(strategy, models, batch)
+    return Ordered(order, [None] * len(order) if sure is None else sure[torch.from_numpy(order)].tolist())
 
 
 def _candidate_windows(

@@ -1,6 +1,6 @@
 """Strategies: which segments to have labeled next. STRATEGIES is the only registry."""
 
-from models.acquisition.base import Models, NonFiniteScoreError, Strategy, score_pool
+from models.acquisition.base import Models, NonFiniteScoreError, Strategy, confidence, score_pool
 from models.acquisition.batch_rules import BATCH_RULES, BatchRule, Candidates, describe, top
 from models.acquisition.confident_cycle import ConfidentCycle
 from models.acquisition.cycle import Cycle
@@ -27,6 +27,7 @@ __all__ = [
     "Models",
     "NonFiniteScoreError",
     "Strategy",
+    "confidence",
     "describe",
     "score_pool",
     "top",

@@ -102,6 +102,22 @@ def require(strategy: Strategy, models: Models) -> None:
         raise ValueError(f"Strategy {strategy.name} needs {', '.join(missing)}, which this round has not trained.")
 
 
+@torch.inference_mode()
+def confidence(strategy: Strategy, models: Models, batch: SegmentBatch, chunk: int = CHUNK) -> Tensor | None:
+    """How sure the strategy's inverse dynamics is of the likeliest actions of segments, on the CPU: (B,) in (0, 1].
+
+    The product over the steps. None where the strategy reads no inverse dynamics.
+    """
+    inverse = next(
+        (getattr(models, name) for name in sorted(strategy.needs) if name.endswith("inverse_dynamics")), None
+    )
+    if inverse is None:
+        return None
+    parts = [batch.take(slice(start, start + chunk)) for start in range(0, batch.size, chunk)]
+    sure = [inverse.log_prob(part).amax(-1).sum(1).exp().clamp(max=1.0).cpu() for part in parts]
+    return torch.cat(sure) if sure else torch.zeros(0)
+
+
 def given(strategy: Strategy, name: str, part: Part | None) -> Part:
     """The part of the models that a strategy reads. Raises ValueError where it is missing."""
     if part is None:

@@ -130,6 +130,7 @@ class AcquisitionItemRow(Row):
     trajectory_id: Mapped[str] = mapped_column(String(64))
     start: Mapped[int]
     score: Mapped[float | None]
+    confidence: Mapped[float | None]
     actions: Mapped[list[object] | None]
     answer: Mapped[str | None] = mapped_column(String(64))
 
@@ -197,6 +198,7 @@ class QueueRow(Row):
     trajectory_id: Mapped[str] = mapped_column(String(64))
     start: Mapped[int]
     score: Mapped[float | None]
+    confidence: Mapped[float | None]
     leased_until: Mapped[datetime | None]
     actions: Mapped[list[object] | None]
     __table_args__ = (Index("ix_queue_segment", "project_id", "trajectory_id", "start"),)

@@ -287,6 +287,22 @@ def test_going_back_before_explorations_forgets_what_was_only_proposed(url: str)
     assert _differences(url) == []
 
 
+def test_confidence_comes_and_goes_with_its_migration(url: str) -> None:
+    migrate(url, "0001")
+    fill(url)
+    migrate(url, "0006")
+    before, schema = read(url), _schema(url)
+    migrate(url, "0007")
+    for table in ("queue", "acquisition_item"):
+        assert {row["confidence"] for row in read(url)[table]} == {None}
+        write(url, f"UPDATE {table} SET confidence = 0.5")  # noqa: S608
+    _downgrade(url, "0006")
+    assert (_version(url), _schema(url), read(url)) == ("0006", schema, before)
+    _check_references(url)
+    migrate(url)
+    assert _differences(url) == []
+
+
 def _quoted(url: str, name: UUID) -> str:
     """As the database writes it."""
     return str(name) if "postgresql" in url else name.hex

@@ -107,6 +107,16 @@ def test_under_top_the_queue_is_the_order_of_scores(trained: Loop) -> None:
     assert best == scores[:10]
 
 
+def test_items_tell_how_sure_the_inverse_model_was(trained: Loop) -> None:
+    batch = trained.acquire(10, "cycle")
+    told = [item.confidence for item in batch.items]
+    assert all(sure is not None and 1 / 7 <= sure <= 1 for sure in told)
+    assert len(set(told)) > 5
+    assert [item.confidence for item in trained.client.acquisition(batch.id).items] == told  # kept, not only answered
+    assert {item.confidence for item in trained.acquire(5, "random").items} == {None}
+    assert {item.confidence for item in trained.acquire(5, "self_inverse").items} == {None}
+
+
 def test_every_batch_rule_queues_the_same_segments_in_its_own_order(trained: Loop) -> None:
     ranked = []
     for rule in BATCH_RULES:

@@ -40,7 +40,7 @@ FREE = and_(
     ~LEASED.exists(),
 )
 # Built once: to build them takes longer than to run them.
-FRONT = select(QueueRow.rank, QueueRow.trajectory_id, QueueRow.start, QueueRow.score).where(FREE)
+FRONT = select(QueueRow.rank, QueueRow.trajectory_id, QueueRow.start, QueueRow.score, QueueRow.confidence).where(FREE)
 FRONT = FRONT.order_by(QueueRow.rank).limit(bindparam("count", type_=Integer()))
 FRONT_LOCKED = FRONT.with_for_update(of=QueueRow, skip_locked=True)
 STILL_FREE = select(QueueRow.rank).where(FREE, QueueRow.rank.between(bindparam("first"), bindparam("last")))
@@ -78,6 +78,7 @@ class Queued(NamedTuple):
     trajectory: str
     start: int
     score: float | None
+    confidence: float | None
 
 
 def newest_ready(
