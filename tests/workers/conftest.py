@@ -88,7 +88,7 @@ def undisturbed(trained_folder: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture(scope="package")
 def trained_folder(tmp_path_factory: pytest.TempPathFactory, labeled_folder: Path) -> Path:
-    """The same with a current round by `cycle` and a subgoal generator."""
+    """The same with a current round by the default strategy and a subgoal generator."""
     folder = tmp_path_factory.mktemp("trained") / "data"
     shutil.copytree(labeled_folder, folder)
     loop = open_loop(folder)
