@@ -5,7 +5,14 @@ from uuid import UUID
 
 from api_schemas.base import Schema, Timestamp
 
-ModelKind = Literal["world_model", "inverse_dynamics", "dense_inverse_dynamics", "ensemble", "subgoal_generator"]
+ModelKind = Literal[
+    "world_model",
+    "inverse_dynamics",
+    "dense_inverse_dynamics",
+    "masked_inverse_dynamics",
+    "ensemble",
+    "subgoal_generator",
+]
 
 
 class ModelVersion(Schema):

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.acquisition.base import CHUNK, Models, given, require
+from models.acquisition.base import CHUNK, Models, NonFiniteScoreError, given, require
 from models.acquisition.batch_rules import BatchRule, Candidates, top
 from models.acquisition.batch_rules.base import description
 from models.acquisition.cycle import Cycle
@@ -61,7 +61,7 @@ def explore(
     """All actions at states x_t (B, ...), each followed by what is inferred along its likeliest future, and scored.
 
     The strategy says whose inverse dynamics infers. after_each: called after each chunk of states, may raise to stop.
-    Raises ValueError when `models` lacks what the strategy needs or a subgoal generator.
+    Raises ValueError when `models` lacks what the strategy needs or a subgoal generator, NonFiniteScoreError.
     """
     require(strategy, models)
     subgoals = given(strategy, "subgoal_generator", models.subgoal_generator)
@@ -78,7 +78,12 @@ def explore(
         actions.append(_candidates(part))
         scores.append(_scores(world_model, inverse, part, actions[-1], usual))
         after_each()
-    return _listed(torch.cat(actions), torch.cat(scores))
+    found = _listed(torch.cat(actions), torch.cat(scores))
+    bad = torch.nonzero(~torch.isfinite(found.scores)).flatten().tolist()
+    if bad:
+        where = f"action {found.actions[bad[0]].tolist()} at state {int(found.states[bad[0]])}"
+        raise NonFiniteScoreError(f"Strategy {strategy.name} gave {float(found.scores[bad[0]])} to {where}.")
+    return found
 
 
 @torch.inference_mode()

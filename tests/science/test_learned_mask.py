@@ -8,7 +8,7 @@ from models.inverse_dynamics.gates import GridCellMaskedInverseDynamics, MaskedI
 from models.networks.gates import PenaltyRamp, inference_gates, open_probability, sample_gates
 from models.networks.grid import touched_cells
 from models.segments import SegmentBatch, at
-from models.training import train
+from models.training import TrainingConfig, train
 from tests.science import toy_grid
 
 
@@ -82,7 +82,7 @@ def test_a_mask_over_latent_coordinates_closes_under_its_penalty(sparsity: float
     config = MaskedInverseDynamicsConfig(over="latent", sparsity=sparsity, free=20, ramp=40, latent=16)
     model = GRID.build_inverse_dynamics(toy_grid.SPACES, "masked", config, generator)
     labeled = toy_grid.labeled(300, seed=2, effective=True)
-    train(model, labeled, GRID.training_config(model.kind, labeled.size), generator)
+    train(model, labeled, TrainingConfig(400, 64, 5e-3, 1e-4), generator)
     kept = model.kept(labeled.observations)
     assert int(kept.min()) == int(kept.max())
     assert (int(kept[0]) == 16) if sparsity == 0.0 else (1 <= int(kept[0]) <= 8)

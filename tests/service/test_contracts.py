@@ -1,6 +1,7 @@
 """What api_schemas says twice is what simulators and strategies say themselves."""
 
 import itertools
+from typing import get_args
 
 import gymnasium as gym
 import pytest
@@ -15,6 +16,7 @@ from api_schemas.environments import (
     Spaces,
     Stream,
 )
+from api_schemas.models import ModelKind
 from api_schemas.strategies import (
     BATCH_RULE_NAMES,
     CATALOG,
@@ -26,6 +28,7 @@ from api_schemas.strategies import (
 )
 from models.acquisition import BATCH_RULES, EXPLORING, STRATEGIES
 from models.acquisition.base import Models
+from models.network import KINDS
 from workers.simulators import minigrid
 from workers.simulators.base import OptionError
 from workers.simulators.catalog import SIMULATORS, behavior_names, make_simulator
@@ -104,3 +107,7 @@ def test_strategies_are_those_of_the_science() -> None:
 def test_a_box_of_seven_joints_is_a_space() -> None:
     spaces = Spaces(observations={"x": Stream(dtype="float32", shape=(3,))}, actions=BoxActions(shape=(7,)))
     assert Spaces.model_validate_json(spaces.model_dump_json()) == spaces
+
+
+def test_the_registry_tells_every_kind_of_network() -> None:
+    assert set(get_args(ModelKind)) == {*KINDS, "ensemble"}

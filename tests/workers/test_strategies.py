@@ -28,6 +28,7 @@ def test_a_strategy_trains_what_it_lacks_and_keeps_the_current_round(trained: Lo
     assert (after.id, after.status, after.error) == (before.id, "current", None)
     assert all(after.models[name] == model for name, model in before.models.items())  # nothing is trained twice
     assert kinds(dict(after.models)) == BASE | NETWORKS[strategy]
+    assert {model.kind for model in trained.client.models(trained.project.id)} >= BASE | NETWORKS[strategy]
     assert after.model_error == before.model_error
     assert [stage.name for stage in after.stages][: len(before.stages)] == [stage.name for stage in before.stages]
 

@@ -86,13 +86,17 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
 
 
 def _arms(extent: Extent) -> list[str]:
-    """Every strategy under top-n and k-means++, or under every batch rule. What draws at random has no rule."""
-    from benchmarks.paper.minigrid.arms import ALL
-    from models.acquisition import BATCH_RULES
+    """Every strategy under top-n and the default rule; in full under every rule, controls and explore mode with them.
 
-    rules = list(BATCH_RULES) if extent == "full" else ["top", "signatures"]
-    scored = [f"{name}:{rule}" for name in sorted(ALL) if name != "random" for rule in rules]
-    return ["random:top", *scored]
+    What draws at random has no rule.
+    """
+    from benchmarks.paper.minigrid.arms import ALL, CHANCE
+    from models.acquisition import BATCH_RULES, STRATEGIES
+
+    full = extent == "full"
+    names, rules = sorted(ALL if full else STRATEGIES), list(BATCH_RULES) if full else ["top", "signatures"]
+    scored = [f"{name}:{rule}" for name in names if name not in ("random", CHANCE) for rule in rules]
+    return ["random:top", *([f"{CHANCE}:top"] if full else []), *scored]
 
 
 if __name__ == "__main__":

@@ -79,10 +79,10 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     parser.add_argument("--seeds", type=int, default=5)
     asked = parser.parse_args(argv)
     rooms = Rooms.of(asked)
-    # One arm first, so that no two train the shared networks; then by seeds, so that an unfinished run has all arms.
+    # One arm first: it trains the networks that all arms share. Then by seeds: an unfinished run has all arms.
     order = [(seed, asked.arms[0]) for seed in range(asked.seeds)]
     order += [(seed, arm) for seed in range(asked.seeds) for arm in asked.arms[1:]]
-    runs = [ArmRun(arm, seed, rooms, asked.out / "networks") for seed, arm in order]
+    runs = [ArmRun(arm, seed, rooms, asked.out / "networks" / rooms.identity) for seed, arm in order]
     rooms.load()  # once, before processes ask for it
     run_missing(runs, asked.out, asked.processes, asked.threads)
     # Arms that have finished more seeds before are told with all of them.

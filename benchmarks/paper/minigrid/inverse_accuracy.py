@@ -3,8 +3,7 @@
     python -m benchmarks.paper.minigrid.inverse_accuracy --seeds 5 --labels 203 466 1556
 
 Trained on the pairs of object and action that the compositional split shows (`composition`), tested on those that it
-holds out. Labels are drawn balanced by action or uniformly; what a service would say of a project with uniform labels
-is printed, word for word.
+holds out. Labels are drawn balanced by action or uniformly.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Figure 9: what world models predict for each action, in pictures.
 
-    python -m benchmarks.paper.minigrid.predictions --arms random:top cycle:kmeans_plus_plus --examples 3
+    python -m benchmarks.paper.minigrid.predictions --arms random:top confident_cycle:signatures --examples 3
 
 For each action a state in which it is effective; below it what happens, and what the world model of each arm predicts
 after its 200 + 3 x 100 labels, those of figure 4d with the same seed. Wrong cells are outlined in red.
@@ -88,13 +88,16 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_options(parser, "9")
     add_files(parser)
-    arms = [Arm("random", "top"), Arm("cycle", "kmeans_plus_plus")]
+    arms = [Arm("random", "top"), Arm("confident_cycle", "signatures")]
     parser.add_argument("--arms", nargs="+", default=arms, type=Arm.parse)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--examples", type=int, default=3)
     asked = parser.parse_args(argv)
     rooms = Rooms.of(asked)
-    runs = [PredictionsRun(arm, asked.seed, asked.examples, rooms, asked.out / "networks") for arm in asked.arms]
+    runs = [
+        PredictionsRun(arm, asked.seed, asked.examples, rooms, asked.out / "networks" / rooms.identity)
+        for arm in asked.arms
+    ]
     rooms.load()  # once, before processes ask for it
     run_missing(runs, asked.out, asked.processes, asked.threads)
     found = results(runs, asked.out)

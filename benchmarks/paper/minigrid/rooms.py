@@ -1,7 +1,9 @@
 """Which rooms figure 4d is about: the project's own, or files in the foreign layout in place of parts of them."""
 
 import argparse
-from dataclasses import dataclass, replace
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -67,8 +69,16 @@ class Rooms:
     @property
     def words(self) -> tuple[str, ...]:
         """What sets results on these rooms apart from those on others."""
-        files = [path.stem for path in (self.test_set, self.pool, self.seed_set, self.video) if path is not None]
-        return ("tuning" if self.tuning else "reported", *([f"data{self.data_seed}"] if self.data_seed else []), *files)
+        return ("tuning" if self.tuning else "reported", self.identity)
+
+    @property
+    def identity(self) -> str:
+        """A digest of all that decides what the rooms hold, files by their content: what is kept for them bears it."""
+        told = {name: value for name, value in asdict(self).items() if name != "folder"}
+        for name in FILES:
+            path: Path | None = told[name]
+            told[name] = None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
+        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
 
     def load(self) -> Data:
         """From files, made where they are not there yet."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from api_schemas.acquisitions import Acquisition
 from api_schemas.collections import CollectionCreate, CollectionLabels
@@ -57,6 +58,7 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     rooms = Rooms(asked.out / "data", asked.tuning, pool_transitions=asked.pool_transitions)
     arm = Arm(asked.strategy, asked.rule)
     os.environ |= {"OMP_NUM_THREADS": "1"}  # of the service's processes, which inherit it
+    torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as url, Client(url) as client:
         online = list(through_service(client, arm, asked.seed, rooms, Plan()))
     return compare(list(offline(arm, asked.seed, rooms, Plan())), online)
