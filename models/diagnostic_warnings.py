@@ -38,7 +38,12 @@ def warnings(diagnostics: Diagnostics, names: Sequence[str] = ()) -> list[str]:
 
     names: of the actions, in order; an action without one goes by its number.
     """
-    return [*_support(diagnostics), *_actions(diagnostics, names), *_ranking(diagnostics), *_others(diagnostics)]
+    return [
+        *_support(diagnostics),
+        *unknown_actions(diagnostics.actions, names),
+        *_ranking(diagnostics),
+        *_others(diagnostics),
+    ]
 
 
 def _support(diagnostics: Diagnostics) -> Iterator[str]:
@@ -50,16 +55,24 @@ def _support(diagnostics: Diagnostics) -> Iterator[str]:
         )
 
 
-def _actions(diagnostics: Diagnostics, names: Sequence[str]) -> Iterator[str]:
-    for number, action in enumerate(diagnostics.actions):
-        if action.accuracy is not None and action.held_out >= FEWEST_STEPS and action.accuracy < ACCURACY:
+def unknown_actions(actions: Sequence[KnownAction], names: Sequence[str] = ()) -> Iterator[str]:
+    """A sentence for each action that labels lack or that is often inferred wrong; names: as in `warnings`."""
+    for number, action in enumerate(actions):
+        reason = _too_little(action)
+        if reason is not None:
             name = names[number] if number < len(names) else f"action {number}"
-            yield f"The inverse model knows too little of {name}: {_known(action, action.accuracy)}."
+            yield f"The inverse model knows too little of {name}: {reason}."
 
 
-def _known(action: KnownAction, accuracy: float) -> str:
+def _too_little(action: KnownAction) -> str | None:
+    """An action that neither labels nor held-out steps show alone may be one without an effect of its own."""
+    if action.labels == 0 and action.held_out > 0:
+        steps = "1 held-out step does" if action.held_out == 1 else f"{action.held_out} held-out steps do"
+        return f"no label shows it, {steps}"
+    if action.accuracy is None or action.held_out < FEWEST_STEPS or action.accuracy >= ACCURACY:
+        return None
     labels = "1 label" if action.labels == 1 else f"{action.labels} labels"
-    return f"{labels}, {_percent(accuracy)} right on held-out segments (less than {_percent(ACCURACY)})"
+    return f"{labels}, {_percent(action.accuracy)} right on held-out segments (less than {_percent(ACCURACY)})"
 
 
 def _ranking(diagnostics: Diagnostics) -> Iterator[str]:

@@ -16,7 +16,7 @@ from models.inverse_dynamics.base import DiscreteInverseDynamics, VerifyingBlock
 from models.rank_correlation import kendall, spearman
 from models.segments import SegmentBatch
 from models.spaces import DiscreteAction
-from models.step_distances import nearest_actions
+from models.step_distances import nearest_true_actions
 from models.support import AfterEach, nearest, whole_observation
 from models.world_models.base import WorldModel
 
@@ -146,16 +146,12 @@ def diagnose(
         ranking_by_group={}
         if held is None
         else {name: _ranking(held.score[chosen], held.loss[chosen]) for name, chosen in members.items()},
-        actions=_known_actions(explanations(inverse_dynamics, labeled), inverse_dynamics, held_out, held),
+        actions=known_actions(
+            explanations(inverse_dynamics, labeled),
+            None if held_out is None else explanations(inverse_dynamics, held_out),
+            None if held is None else held.right,
+        ),
     )
-
-
-def true_loss(world_model: WorldModel, batch: SegmentBatch, sets: Tensor) -> Tensor:
-    """The world model's distance under the true actions, of those in `sets` (B, L, n) the ones it is best at: (B,).
-
-    All actions in the set of a step are true, so the world model errs by its smallest distance over them.
-    """
-    return nearest_actions(world_model, batch.observations, sets)[1]
 
 
 def explanations(inverse_dynamics: DiscreteInverseDynamics, batch: SegmentBatch) -> Tensor:
@@ -168,8 +164,23 @@ def explanations(inverse_dynamics: DiscreteInverseDynamics, batch: SegmentBatch)
         raise ValueError(f"Diagnostics need a discrete action space, got {space}.")
     if batch.actions is None:
         raise ValueError("Diagnostics need labeled segments; the batch carries no actions.")
-    return (
-        torch.nn.functional.one_hot(batch.actions, space.n).bool() if batch.action_sets is None else batch.action_sets
+    return batch.explanations(space.n)
+
+
+def known_actions(labels: Tensor, held_out: Tensor | None, right: Tensor | None) -> tuple[KnownAction, ...]:
+    """What is known of each of n actions.
+
+    labels, held_out: the actions that explain each step, bool (B, L, n). right: the inferred action of each held-out
+    step is among them, bool (B, L).
+    """
+    alone = labels[labels.sum(-1) == 1].sum(0).tolist()  # (B, L, n) -> (n,)
+    if held_out is None or right is None:
+        return tuple(KnownAction(count, 0, None) for count in alone)
+    unique = held_out.sum(-1) == 1  # (B, L)
+    asked, inferred = held_out[unique].sum(0).tolist(), held_out[unique & right].sum(0).tolist()
+    return tuple(
+        KnownAction(count, of, good / of if of else None)
+        for count, of, good in zip(alone, asked, inferred, strict=True)
     )
 
 
@@ -234,7 +245,7 @@ def _held_out(
         sets = explanations(inverse_dynamics, part)
         inferred, score = cycle(world_model, inverse_dynamics, part.observations)
         right = sets.gather(2, inferred.unsqueeze(2)).squeeze(2)
-        loss = true_loss(world_model, part, sets)
+        loss = nearest_true_actions(world_model, part)[1]
         _require_finite(part, score, loss)
         parts.append((score, loss, right))
         after_each()
@@ -250,20 +261,6 @@ def _require_finite(batch: SegmentBatch, score: Tensor, loss: Tensor) -> None:
 
 def _ranking(score: Tensor, loss: Tensor) -> Ranking:
     return Ranking(len(score), spearman(score, loss), kendall(score, loss))
-
-
-def _known_actions(
-    labels: Tensor, inverse_dynamics: DiscreteInverseDynamics, held_out: SegmentBatch | None, held: _HeldOut | None
-) -> tuple[KnownAction, ...]:
-    alone = labels[labels.sum(-1) == 1].sum(0).tolist()  # (B, L, n) -> (n,)
-    if held_out is None or held is None:
-        return tuple(KnownAction(count, 0, None) for count in alone)
-    sets = explanations(inverse_dynamics, held_out)
-    unique = sets.sum(-1) == 1  # (B, L)
-    asked, right = sets[unique].sum(0).tolist(), sets[unique & held.right].sum(0).tolist()
-    return tuple(
-        KnownAction(count, of, good / of if of else None) for count, of, good in zip(alone, asked, right, strict=True)
-    )
 
 
 def _in_group(batch: SegmentBatch, actions: set[int]) -> Tensor:

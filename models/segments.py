@@ -105,8 +105,19 @@ class SegmentBatch:
         draw = torch.rand(self.action_sets.shape, generator=generator, device=generator.device)
         return replace(self, actions=(draw.to(self.action_sets.device) * self.action_sets).argmax(-1))
 
+    def explanations(self, count: int) -> Tensor:
+        """The actions that explain each step, of `count`: bool (B, L, count), the label's set, else its action alone.
+
+        Raises ValueError for a batch without actions.
+        """
+        if self.action_sets is not None:
+            return self.action_sets
+        if self.actions is None:
+            raise ValueError("Which actions explain a step only labels tell; the batch carries no actions.")
+        return torch.nn.functional.one_hot(self.actions, count).bool()
+
     def without_labels(self) -> "SegmentBatch":
-        """The observations alone, as a subgoal generator may see them."""
+        """The observations alone, as who infers the actions may see them."""
         return SegmentBatch(self.observations, segments=self.segments)
 
 
@@ -137,15 +148,7 @@ def _concatenate_sets(batches: Sequence[SegmentBatch]) -> Tensor | None:
     if not known:
         return None
     count = int(known[0].shape[-1])
-    return torch.cat([_sets(batch, count) for batch in batches])
-
-
-def _sets(batch: SegmentBatch, count: int) -> Tensor:
-    if batch.action_sets is not None:
-        return batch.action_sets
-    if batch.actions is None:
-        raise ValueError("A batch without action_sets and actions cannot be joined to one with action_sets.")
-    return torch.nn.functional.one_hot(batch.actions, count).bool()
+    return torch.cat([batch.explanations(count) for batch in batches])
 
 
 def first(observations: Observations) -> Observations:

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.segments import Observations, first
+from models.segments import Observations, SegmentBatch, first, future
+from models.spaces import DiscreteAction
 from models.world_models.base import WorldModel
 
 
@@ -52,3 +53,23 @@ def nearest_actions(world_model: WorldModel, observations: Observations, asked: 
         state, total = distances.state(action), total + nearest
         actions.append(action)
     return torch.stack(actions, 1), total
+
+
+def rollout_error(world_model: WorldModel, batch: SegmentBatch, actions: Tensor) -> Tensor:
+    """l(x_{t+1:t+L}, f(a | z_t)) of segments under actions (B, L) -> (B,)."""
+    prediction = world_model.rollout(world_model.infer_state(first(batch.observations)), actions)
+    return world_model.distance(prediction, future(batch.observations))
+
+
+def nearest_true_actions(world_model: WorldModel, batch: SegmentBatch) -> tuple[Tensor, Tensor]:
+    """Of the actions that explain each step, those the world model is best at, (B, L), and its true loss (B,).
+
+    All actions in the set of a step are true, so the world model errs by its smallest distance over them. Continuous
+    actions have no sets. Raises ValueError for a batch without actions.
+    """
+    space = world_model.spaces.action
+    if isinstance(space, DiscreteAction):
+        return nearest_actions(world_model, batch.observations, batch.explanations(space.n))
+    if batch.actions is None:
+        raise ValueError("The true loss needs labeled segments; the batch carries no actions.")
+    return batch.actions, rollout_error(world_model, batch, batch.actions)

@@ -125,11 +125,11 @@ def given(strategy: Strategy, name: str, part: Part | None) -> Part:
     return part
 
 
-def labels(strategy: Strategy, batch: SegmentBatch) -> Tensor:
-    """The hidden actions (B, L) that a privileged strategy looks at. Raises ValueError for an unlabeled batch."""
+def labeled(strategy: Strategy, batch: SegmentBatch) -> SegmentBatch:
+    """The batch, for a privileged strategy that looks at its hidden actions. Raises ValueError for an unlabeled one."""
     if batch.actions is None:
         raise ValueError(f"Strategy {strategy.name} is privileged: it needs the actions, which these segments lack.")
-    return batch.actions
+    return batch
 
 
 def _require_finite(strategy: Strategy, scores: Tensor, batch: SegmentBatch) -> None:

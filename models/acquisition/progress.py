@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.acquisition.base import Models, given, labels
-from models.segments import SegmentBatch, first, future
-from models.world_models.base import WorldModel
+from models.acquisition.base import Models, given, labeled
+from models.segments import SegmentBatch
+from models.step_distances import nearest_true_actions, rollout_error
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,14 @@ class TrueProgress(Progress):
     needs: frozenset[str] = frozenset({"world_model", "previous_world_model"})
 
     def actions(self, models: Models, batch: SegmentBatch) -> Tensor:
-        """The true ones."""
-        return labels(self, batch)
+        """The true ones, of several the one that the world model is best at now."""
+        world_model = given(self, "world_model", models.world_model)
+        return nearest_true_actions(world_model, labeled(self, batch))[0]
 
-
-def rollout_error(world_model: WorldModel, batch: SegmentBatch, actions: Tensor) -> Tensor:
-    """l(x_{t+1:t+L}, f(a | z_t)) of segments under actions (B, L) -> (B,)."""
-    prediction = world_model.rollout(world_model.infer_state(first(batch.observations)), actions)
-    return world_model.distance(prediction, future(batch.observations))
+    @torch.inference_mode()
+    def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
+        """(B,) in true loss; below 0 where it has become worse. Draws nothing."""
+        now = nearest_true_actions(given(self, "world_model", models.world_model), labeled(self, batch))[1]
+        if models.previous_world_model is None:
+            return now
+        return nearest_true_actions(models.previous_world_model, batch)[1] - now

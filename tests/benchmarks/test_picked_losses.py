@@ -7,19 +7,23 @@ import numpy as np
 import pytest
 
 from benchmarks.paper.minigrid.picked_losses import finished, losses, main
+from benchmarks.paper.minigrid.rooms import Rooms
+from benchmarks.paper.runs import code_digest
 
 
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
-    """Two seeds of an arm, one of another, one in rooms for tuning, one with a file's test, and a stranger."""
-    folder = tmp_path / "4d"
+    """Two seeds of an arm, one of another; one in rooms for tuning, one on a file's test, one of other code; no run."""
+    folder, theirs = tmp_path / "4d", tmp_path / "theirs.npz"
     folder.mkdir()
+    theirs.write_bytes(b"rooms")
     _write(folder, "cycle:top", 0, "reported", [1.0, 2.0])
     _write(folder, "cycle:top", 1, "reported", [3.0, 6.0])
     _write(folder, "random:top", 0, "reported", [0.5, 0.5])
     _write(folder, "random:top", 0, "tuning", [100.0])
-    _write(folder, "random:top", 0, "reported-theirs", [200.0])
-    (folder / "other.json").write_text(json.dumps({"name": "other"}))
+    _write(folder, "random:top", 1, "reported", [200.0], theirs)
+    _write(folder, "random:top", 2, "reported", [300.0], code="other")
+    (folder / "other.json").write_text(json.dumps({"name": "other", "code": code_digest()}))
     return folder
 
 
@@ -48,7 +52,17 @@ def test_without_results_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "no finished result of figure 4d" in capsys.readouterr().out
 
 
-def _write(folder: Path, arm: str, seed: int, rooms: str, true_losses: list[float]) -> None:
+def _write(
+    folder: Path,
+    arm: str,
+    seed: int,
+    rooms: str,
+    true_losses: list[float],
+    test_set: Path | None = None,
+    code: str | None = None,
+) -> None:
     name = f"{arm.replace(':', '-')}-{seed}-{rooms}"
+    words = Rooms(folder / "data", rooms == "tuning", test_set=test_set).words
     rounds = [{"picks": {"true_losses": true_losses}}, {"picks": {}}]
-    (folder / f"{name}.json").write_text(json.dumps({"name": name, "arm": arm, "seed": seed, "rounds": rounds}))
+    told = {"name": name, "code": code or code_digest(), "arm": arm, "seed": seed, "rooms": words, "rounds": rounds}
+    (folder / f"{name}.json").write_text(json.dumps(told))

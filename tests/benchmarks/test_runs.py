@@ -1,11 +1,13 @@
 """Runs of a benchmark: done once, in their own processes, and a file only of what has ended."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from benchmarks.paper.runs import Json, result_file, results, run_missing
+from benchmarks.paper import runs
+from benchmarks.paper.runs import Json, code_digest, result_file, results, run_missing
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,31 @@ def test_a_finished_run_is_not_repeated_and_a_missing_one_is_done(tmp_path: Path
     run_missing([one, two], out, 1, 1)
     assert log.read_text().split() == ["1", "2", "1"]
     assert [each["doubled"] for each in results([two, never, one], out)] == [4, 2]
+
+
+def test_results_of_other_code_are_not_told_and_made_again(
+    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, run = tmp_path / "out", Count(1, log)
+    run_missing([run], out, 1, 1)
+    file = result_file(out, run)
+    told = json.loads(file.read_text())
+    assert told["code"] == code_digest()
+    file.write_text(json.dumps(told | {"code": "other", "doubled": -1}))
+    assert results([run], out) == []
+    run_missing([run], out, 1, 1)
+    assert f"1 results in {out} are of other code" in capsys.readouterr().out
+    assert [each["doubled"] for each in results([run], out)] == [2]
+
+
+def test_the_codes_digest_turns_on_what_results_depend_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runs, "ROOT", tmp_path)
+    digests = list[str]()
+    for file in ("models/a.py", "models/a.py", "benchmarks/paper/minigrid/b_table.py", "README.md", "workers/c.py"):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text(f"x = {len(digests)}")
+        digests.append(code_digest.__wrapped__())
+    assert digests[0] != digests[1] == digests[2] == digests[3] != digests[4]
 
 
 def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path: Path, log: Path) -> None:

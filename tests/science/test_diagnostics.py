@@ -1,49 +1,29 @@
-"""Diagnostics on toy rooms whose answers are known, and what they say to people."""
+"""Diagnostics on toy rooms whose answers are known."""
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from models.diagnostic_warnings import warnings
 from models.diagnostics import (
     CHUNK,
-    Aliasing,
     BackAction,
-    Diagnostics,
-    KnownAction,
     Mask,
-    Ranking,
     Support,
     diagnose,
-    explanations,
-    true_loss,
 )
 from models.families import GRID
 from models.inverse_dynamics.base import DiscreteInverseDynamics
 from models.inverse_dynamics.grid import GridSparseInverseDynamics, SparseInverseDynamicsConfig
 from models.network import Network
 from models.networks.symmetry import turn
-from models.segments import Observations, SegmentBatch, first
+from models.segments import Observations, SegmentBatch
 from models.spaces import BoxAction, Spaces
 from models.support import nearest, whole_observation
 from models.world_models.grid import GridWorldModel
 from tests.science import toy_grid
-
-WELL = Diagnostics(
-    sampled=2000,
-    mask=Mask(3.0, 37),
-    support=Support(0.05, 0.1, 1.0),
-    aliasing=Aliasing(0.2, 0.9, 0.1),
-    back_action=BackAction(1000, 0.2, 0.4, 0.3),
-    back_action_in_support=BackAction(700, 0.01, 0.02, 0.0),
-    ranking=Ranking(1000, 0.9, 0.7),
-    ranking_by_group={},
-    actions=(KnownAction(50, 100, 0.95),) * 2,
-)
 
 
 class Sure(GridSparseInverseDynamics):
@@ -241,37 +221,6 @@ def test_the_score_ranks_where_the_inverse_model_knows_the_actions(
     assert blind.spearman < found.ranking.spearman - 0.2
 
 
-def test_the_true_loss_is_the_smallest_over_the_actions_that_explain_a_step(
-    world_model: GridWorldModel, inverse_dynamics: DiscreteInverseDynamics, training_set: SegmentBatch
-) -> None:
-    some = training_set.take(slice(0, 200))
-    sets = explanations(inverse_dynamics, some)
-    assert bool((sets.sum(2) > 1).any())
-    with torch.inference_mode():
-        state = world_model.infer_state(first(some.observations))
-        after = {name: stream[:, 1:] for name, stream in some.observations.items()}
-        every = [
-            world_model.distance(world_model.rollout(state, torch.full((200, 1), action)), after) for action in range(7)
-        ]
-        loss = true_loss(world_model, some, sets)
-    expected = torch.stack(every, 1).masked_fill(~sets[:, 0], torch.inf).amin(1)
-    assert torch.allclose(loss, expected, atol=1e-4)
-
-
-def test_the_true_loss_of_longer_segments_is_that_of_their_rollout(
-    world_model: GridWorldModel, inverse_dynamics: DiscreteInverseDynamics, training_set: SegmentBatch
-) -> None:
-    pairs = training_set.take(slice(0, 9)).observations
-    frames = {name: stream.flatten(0, 1).view(3, 6, *stream.shape[2:]) for name, stream in pairs.items()}
-    actions = torch.randint(7, (3, 5), generator=torch.Generator().manual_seed(0))
-    batch = SegmentBatch(frames, actions)
-    with torch.inference_mode():
-        prediction = world_model.rollout(world_model.infer_state(first(frames)), actions)
-        expected = world_model.distance(prediction, {name: stream[:, 1:] for name, stream in frames.items()})
-        loss = true_loss(world_model, batch, explanations(inverse_dynamics, batch))
-    assert torch.allclose(loss, expected, rtol=1e-4)
-
-
 def test_an_action_is_known_by_the_steps_that_it_alone_explains(
     world_model: GridWorldModel, training_set: SegmentBatch, held_out: SegmentBatch
 ) -> None:
@@ -333,56 +282,10 @@ def test_what_cannot_be_diagnosed_is_refused(
     broken = torch.full((held_out.size,), 1.0)
     broken[7] = torch.nan
     with monkeypatch.context() as patch:
-        patch.setattr("models.diagnostics.true_loss", lambda _, batch, __: broken[: batch.size])
+        patch.setattr("models.diagnostics.nearest_true_actions", lambda _, batch: (None, broken[: batch.size]))
         with pytest.raises(ValueError, match=r"Segment\(trajectory='toy-1', start=7\) has score .* true loss nan"):
             diagnose(world_model, inverse_dynamics, held_out, None, held_out, {})
     model = sure()
     model.spaces = Spaces(toy_grid.SPACES.observations, BoxAction(-1.0, 1.0, (2,)))
     with pytest.raises(ValueError, match="need a discrete action space"):
         diagnose(world_model, model, held_out, None, None, {})
-
-
-def test_where_all_is_well_or_unknown_there_is_nothing_to_say() -> None:
-    assert warnings(WELL) == []
-    unknown = replace(
-        WELL, mask=None, support=None, aliasing=None, back_action_in_support=None, ranking=None, actions=()
-    )
-    assert warnings(unknown) == []
-    few = replace(WELL, ranking=Ranking(14, 0.1, 0.1), back_action_in_support=BackAction(14, 0.0, 0.9, 0.8))
-    assert warnings(replace(few, actions=(KnownAction(3, 2, 0.0), KnownAction(0, 0, None)))) == []
-
-
-FINDINGS: list[tuple[dict[str, Any], str]] = [
-    (
-        {"support": Support(0.412, 1.0, 4.0)},
-        "The verifier has left its support: 41 % of the pool's segments show it something that no label shows "
-        "(more than 20 %).",
-    ),
-    (
-        {"actions": (KnownAction(50, 100, 0.95), KnownAction(3, 20, 0.4))},
-        "The inverse model knows too little of swap: 3 labels, 40 % right on held-out segments (less than 70 %).",
-    ),
-    (
-        {"ranking": Ranking(300, 0.314, 0.2)},
-        "The score does not rank: Spearman 0.31 with the true loss on held-out segments (less than 0.50).",
-    ),
-    (
-        {"aliasing": Aliasing(1.0, 2.0, 0.6)},
-        "Several actions explain most of the pool alike: on 60 % of it the inverse model is in more doubt than "
-        "between two (more than 50 %).",
-    ),
-    (
-        {"back_action_in_support": BackAction(700, 0.05, 0.3, 0.4)},
-        "What the verifier does not look at misleads it: 30 % inferred wrong where that is farthest from the labels, "
-        "5 % where it is nearest.",
-    ),
-]
-
-
-def test_each_finding_is_a_sentence() -> None:
-    for changed, sentence in FINDINGS:
-        assert warnings(replace(WELL, **changed), ("forward", "swap")) == [sentence]
-    everything = replace(WELL, **{name: value for changed, _ in FINDINGS for name, value in changed.items()})
-    assert warnings(everything, ("forward", "swap")) == [sentence for _, sentence in FINDINGS]
-    one = replace(WELL, actions=(KnownAction(1, 20, 0.4),))
-    assert warnings(one)[0].startswith("The inverse model knows too little of action 0: 1 label, 40 % right")

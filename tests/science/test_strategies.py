@@ -64,7 +64,8 @@ def test_a_strategy_gives_each_segment_one_finite_score_and_repeats_it(
 def test_a_score_does_not_depend_on_the_rest_of_the_batch(name: str, models: Models, pool: SegmentBatch) -> None:
     shuffled = torch.randperm(pool.size, generator=torch.Generator().manual_seed(1))
     scores = _score(STRATEGIES[name], models, pool)
-    torch.testing.assert_close(_score(STRATEGIES[name], models, pool.take(shuffled)), scores[shuffled])
+    again = _score(STRATEGIES[name], models, pool.take(shuffled))
+    torch.testing.assert_close(again, scores[shuffled], rtol=1e-5, atol=1e-5)  # of networks in single precision
 
 
 @pytest.mark.parametrize("name", [name for name, strategy in STRATEGIES.items() if strategy.needs])
@@ -79,7 +80,8 @@ def test_a_strategy_says_under_which_actions_it_looks(name: str, models: Models,
     actions = STRATEGIES[name].actions(models, pool)
     assert actions is not None
     assert (tuple(actions.shape), actions.dtype) == ((pool.size, 1), torch.int64)
-    assert torch.equal(actions, pool.actions) if STRATEGIES[name].privileged else True  # type: ignore[arg-type]
+    if STRATEGIES[name].privileged:
+        assert bool(pool.explanations(toy_grid.ACTIONS).gather(2, actions.unsqueeze(2)).all())
 
 
 @pytest.mark.parametrize("name", [name for name, strategy in STRATEGIES.items() if strategy.privileged])

@@ -16,11 +16,17 @@ from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
+from api_schemas.strategies import DEFAULT_BATCH_RULE, DEFAULT_STRATEGY
 from benchmarks.figures import Figure, finish
 
 Extent = Literal["quick", "usual", "full"]
-FEW = ("random:top", "oracle:top", "confident_cycle:signatures", "uncertainty:signatures")
-MANY_SEEDS = (*FEW, "cycle:signatures", "self_inverse:signatures")  # the arms with 10 seeds
+FEW = (
+    "random:top",
+    "oracle:top",
+    f"{DEFAULT_STRATEGY}:{DEFAULT_BATCH_RULE}",
+    f"uncertainty:{DEFAULT_BATCH_RULE}",
+)
+MANY_SEEDS = (*FEW, f"cycle:{DEFAULT_BATCH_RULE}", f"self_inverse:{DEFAULT_BATCH_RULE}")  # the arms with 10 seeds
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,7 @@ def _arms(extent: Extent) -> list[str]:
     from models.acquisition import BATCH_RULES, STRATEGIES
 
     full = extent == "full"
-    names, rules = sorted(ALL if full else STRATEGIES), list(BATCH_RULES) if full else ["top", "signatures"]
+    names, rules = sorted(ALL if full else STRATEGIES), list(BATCH_RULES) if full else ["top", DEFAULT_BATCH_RULE]
     scored = [f"{name}:{rule}" for name in names if name not in ("random", CHANCE) for rule in rules]
     return ["random:top", *([f"{CHANCE}:top"] if full else []), *scored]
 

@@ -1,6 +1,6 @@
 """Figure 4d: what an arm's labels are worth. 200 uniform labels, then batches of 100 chosen by the arm.
 
-    python -m benchmarks.paper.minigrid.acquisition --arms confident_cycle:signatures random:top --seeds 5
+    python -m benchmarks.paper.minigrid.acquisition --arms random:top confident_cycle:signatures --seeds 5
 
 An arm is `strategy:rule`. All arms get the same pool, seed labels, budgets, schedules and draws.
 """
@@ -13,26 +13,27 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from api_schemas.strategies import DEFAULT_BATCH_RULE, DEFAULT_STRATEGY
 from benchmarks.figures import Figure, finish
 from benchmarks.paper.minigrid import acquisition_table
 from benchmarks.paper.minigrid.action_following import action_following
 from benchmarks.paper.minigrid.arms import EXPLORERS, Arm
-from benchmarks.paper.minigrid.datasets import ACTIONS, load_states
+from benchmarks.paper.minigrid.datasets import GROUPS, load_states
 from benchmarks.paper.minigrid.exploration import Exploration
 from benchmarks.paper.minigrid.loop import Experiment, Round, errors, pool_losses, strategy_scores
 from benchmarks.paper.minigrid.rooms import Data, Rooms, add_files
 from benchmarks.paper.runs import Json, add_options, results, run_missing
-from models.diagnostics import explanations, true_loss
-from models.evaluation import transition_errors
 from models.rank_correlation import kendall, spearman
 from models.segments import SegmentBatch
+from workers.simulators.minigrid_rules import ACTION_NAMES
 
 MOST_SEEDS = 100
+BY_ACTION = {name: {action} for action, name in enumerate(ACTION_NAMES)}
 MOVEMENT = 3  # actions below it are movements
 WITHOUT_RANKS = ("random", "no_score", "oracle_uniform", "fidelity", *EXPLORERS)
 """Their scores are draws, turn on the pool, or are of what was not observed."""
-DEFAULT = Arm("confident_cycle", "signatures")
-ARMS = (Arm("random", "top"), DEFAULT, Arm("oracle", "top"), Arm("self_inverse", "signatures"))
+DEFAULT = Arm(DEFAULT_STRATEGY, DEFAULT_BATCH_RULE)
+ARMS = (Arm("random", "top"), DEFAULT, Arm("oracle", "top"), Arm("self_inverse", DEFAULT_BATCH_RULE))
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class ArmRun:
         """After every round: model error on each test, rank correlations, what was picked."""
         data = self.rooms.load()
         rounds = [_told(self.arm, found, data) for found in self._experiment(data).rounds()]
-        return {"arm": self.arm.name, "seed": self.seed, "rounds": rounds}
+        return {"arm": self.arm.name, "seed": self.seed, "rooms": self.rooms.words, "rounds": rounds}
 
     def _experiment(self, data: Data) -> Experiment:
         """In explore mode with the simulator's states, at which nobody but the labeler looks."""
@@ -92,10 +93,9 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
 
 def _told(arm: Arm, found: Round, data: Data) -> Json:
     told: Json = {"labels": found.labeled.size}
-    for name, error in errors(found.models, data.tests).items():
+    for name, error in errors(found.models, data.tests, GROUPS | BY_ACTION).items():
         groups = {"overall": error.overall, **error.groups}
         told[name] = {group: _short(asdict(each)) for group, each in groups.items()}
-    told["inverse_by_action"] = _inverse_by_action(found, data.tests["balanced"])
     told["ranks"] = _ranks(arm, found, data.tests["natural"])
     told["picks"] = _picks(found)
     if data.outcomes is not None and found.models.world_model is not None:
@@ -112,26 +112,13 @@ def _short(error: Json) -> Json:
     }
 
 
-def _inverse_by_action(found: Round, test: SegmentBatch) -> list[float | None]:
-    assert found.models.world_model is not None
-    assert test.actions is not None
-    right = transition_errors(found.models.world_model, test, found.models.inverse_dynamics).inverse_correct
-    assert right is not None
-    chosen = [right[test.actions[:, 0] == action].double() for action in range(ACTIONS)]
-    return [float(each.mean()) if len(each) else None for each in chosen]
-
-
 def _ranks(arm: Arm, found: Round, test: SegmentBatch) -> Json:
     """Rank correlation of the arm's score with the true loss, on data of natural frequency."""
     if arm.strategy in WITHOUT_RANKS:
         return {}
-    models, inverse = found.models, found.models.inverse_dynamics
-    assert models.world_model is not None
-    assert inverse is not None
     assert test.actions is not None
-    with torch.inference_mode():
-        loss = true_loss(models.world_model, test, explanations(inverse, test))
-    score = strategy_scores(arm.strategy, models, test)
+    loss = pool_losses(found.models, test)
+    score = strategy_scores(arm.strategy, found.models, test)
     moves = test.actions[:, 0] < MOVEMENT
     groups = {"overall": torch.ones_like(moves), "movement": moves, "interaction": ~moves}
     return {name: _correlations(score[group], loss[group]) for name, group in groups.items()}

@@ -5,8 +5,8 @@ nowhere used, a step that several actions explain carries them all.
 """
 
 import hashlib
+import io
 import json
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.paper.runs import write_at_once
 from models.segments import Segment, SegmentBatch
 from models.spaces import DiscreteAction, Spaces, StreamSpec
 from service.store import codec
@@ -114,11 +115,9 @@ def _file(spec: DataSpec, folder: Path) -> Path:
 
 
 def _save(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """At once: another process may be making the same set."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".unfinished", delete=False) as file:
-        np.savez_compressed(file, **arrays)
-    Path(file.name).replace(path)
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **arrays)
+    write_at_once(path, packed.getvalue())
 
 
 def draw_labels(batch: SegmentBatch, rng: np.random.Generator) -> SegmentBatch:

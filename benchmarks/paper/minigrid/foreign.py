@@ -39,12 +39,17 @@ def read(path: Path) -> SegmentBatch:
     grid = np.stack((before, after), 1)  # (N, 2, H, W, 3)
     if _columns_come_first(grid, actions):
         grid = grid.swapaxes(2, 3)
-    name = f"{path.stem}-{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}"
+    name = f"{path.stem}-{digest(path)}"
     return SegmentBatch(
         {"grid": torch.from_numpy(np.ascontiguousarray(grid)), "carried": torch.from_numpy(np.stack(hands, 1))},
         torch.from_numpy(actions).unsqueeze(1),
         segments=tuple(Segment(name, row) for row in range(len(actions))),
     )
+
+
+def digest(path: Path) -> str:
+    """Of what the file holds: results on it bear it, so that another file of the same name does not pass for it."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def write(batch: SegmentBatch, path: Path) -> None:

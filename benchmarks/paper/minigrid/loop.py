@@ -14,15 +14,16 @@ from torch import Tensor
 
 from benchmarks.paper.minigrid.arms import Arm
 from benchmarks.paper.minigrid.datasets import GROUPS, draw_labels
+from benchmarks.paper.runs import write_at_once
 from models import checkpoints
-from models.acquisition import STRATEGIES, Models, describe, score_pool, top
+from models.acquisition import STRATEGIES, Models, Strategy, describe, score_pool, top
 from models.chance import scoring_generator, training_generator
-from models.diagnostics import explanations, true_loss
 from models.evaluation import ModelError, evaluate
 from models.families import GRID
 from models.network import Network
 from models.segments import SegmentBatch, concatenate
 from models.spaces import Spaces
+from models.step_distances import nearest_true_actions
 from models.training import train
 from workers.data import CHUNK_SEGMENTS
 from workers.training import BASE, ENSEMBLE_MEMBERS
@@ -128,7 +129,7 @@ class Experiment:
         network = GRID.build(built, self.spaces, {}, generator)
         train(network, labeled, GRID.training_config(built, labeled.size), generator)
         if kept is not None:
-            _keep(network, kept)
+            write_at_once(kept, checkpoints.save(network))
         return network
 
     def _scores(self, number: int, models: Models) -> Tensor:
@@ -136,10 +137,9 @@ class Experiment:
         if not self.arm.scores.needs:
             return self._uniform()
         generator = scoring_generator(self.seed, self.arm.strategy, number, self.trajectories, "shard 0")
-        seen = self.pool if self.arm.scores.privileged else self.pool.without_labels()
-        strategy = self.arm.scores
-        if strategy.privileged:  # never scored by the service; some need the whole pool at once
-            return score_pool(strategy, models, draw_labels(seen, np.random.default_rng(self.seed)), generator).float()
+        strategy, seen = self.arm.scores, _seen(self.arm.scores, self.pool)
+        if strategy.privileged:  # never scored by the service; some need the whole pool at once, or double precision
+            return score_pool(strategy, models, seen, generator)
         return torch.cat([score_pool(strategy, models, part, generator) for part in parts_of(seen)]).float()
 
     def _chosen(
@@ -156,7 +156,7 @@ class Experiment:
         if not strategy.needs:
             return candidates[: self.plan.batch_labels]
         generator = scoring_generator(self.seed, self.arm.strategy, number, self.trajectories, "selection 0")
-        described = describe(rule, strategy, models, self.pool.take(candidates), scores[candidates])
+        described = describe(rule, strategy, models, _seen(strategy, self.pool).take(candidates), scores[candidates])
         return candidates[rule.order(described, len(candidates), generator)][: self.plan.batch_labels]
 
 
@@ -170,29 +170,27 @@ def parts_of(pool: SegmentBatch) -> Iterator[SegmentBatch]:
             start = place
 
 
-def errors(models: Models, tests: Mapping[str, SegmentBatch]) -> dict[str, ModelError]:
-    """Model error on each labeled test set."""
+def errors(
+    models: Models, tests: Mapping[str, SegmentBatch], groups: Mapping[str, set[int]] = GROUPS
+) -> dict[str, ModelError]:
+    """Model error on each labeled test set, overall and by group."""
     assert models.world_model is not None
-    return {name: evaluate(models.world_model, test, GROUPS, models.inverse_dynamics) for name, test in tests.items()}
+    return {name: evaluate(models.world_model, test, groups, models.inverse_dynamics) for name, test in tests.items()}
 
 
 def pool_losses(models: Models, pool: SegmentBatch) -> Tensor:
     """The true loss (N,) of each segment, the smallest over the actions that explain it."""
     assert models.world_model is not None
-    inverse = models.inverse_dynamics
-    assert inverse is not None
     with torch.inference_mode():
-        parts = [true_loss(models.world_model, part, explanations(inverse, part)) for part in parts_of(pool)]
-    return torch.cat(parts)
-
-
-def _keep(network: Network, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(f".{id(network)}")
-    unfinished.write_bytes(checkpoints.save(network))
-    unfinished.replace(path)
+        return torch.cat([nearest_true_actions(models.world_model, part)[1] for part in parts_of(pool)])
 
 
 def strategy_scores(strategy: str, models: Models, batch: SegmentBatch) -> Tensor:
     """Scores (B,) of a strategy that draws nothing."""
-    return score_pool(STRATEGIES[strategy], models, batch, torch.Generator())
+    chosen = STRATEGIES[strategy]
+    return score_pool(chosen, models, _seen(chosen, batch), torch.Generator())
+
+
+def _seen(strategy: Strategy, batch: SegmentBatch) -> SegmentBatch:
+    """What a strategy may look at: the labels only if it is privileged."""
+    return batch if strategy.privileged else batch.without_labels()

@@ -7,7 +7,6 @@ picks well picks what the model does not know yet, and not only the worst of one
 """
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +14,8 @@ import numpy as np
 
 from benchmarks.figures import Figure, finish
 from benchmarks.paper import charts
-from benchmarks.paper.runs import Json, add_options
+from benchmarks.paper.minigrid.rooms import Rooms
+from benchmarks.paper.runs import Json, add_options, read
 
 SHARES = (0.05, 0.25, 0.5, 0.75, 0.95)
 Losses = dict[str, dict[int, list[float]]]  # by arm and round, of all seeds
@@ -41,10 +41,10 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
 
 
 def finished(folder: Path, tuning: bool) -> list[Json]:
-    """Results of figure 4d in its own rooms, reported or for tuning, by name; none of others' files."""
-    told = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
-    rooms = "tuning" if tuning else "reported"
-    return [each for each in told if "arm" in each and each.get("name", "").endswith(f"-{each['seed']}-{rooms}")]
+    """Results of figure 4d in its own rooms, reported or for tuning; none of others' files, nor of other code."""
+    told = [read(path) for path in sorted(folder.glob("*.json"))]
+    words = list(Rooms(folder / "data", tuning).words)
+    return [each for each in told if each is not None and each.get("rooms") == words]
 
 
 def losses(results: Sequence[Json]) -> Losses:

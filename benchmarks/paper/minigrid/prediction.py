@@ -69,7 +69,7 @@ class PredictionRun:
     def name(self) -> str:
         """Of its file."""
         rooms = "tuning" if self.tuning else "reported"
-        file = [] if self.test_set is None else [self.test_set.stem]
+        file = [] if self.test_set is None else [foreign.digest(self.test_set)]
         return "-".join((self.trained.name, self.draw, str(self.labels), str(self.seed), rooms, *file))
 
     def results(self) -> Json:

@@ -15,6 +15,7 @@ from benchmarks.paper.minigrid.datasets import ACTIONS, REPORTED, TUNING, DataSp
 from models.segments import SegmentBatch
 from models.spaces import Spaces
 
+MOST_DATA_SEEDS = 10_000  # ten layout seeds each, below the first room of figure 4a
 FILES = {
     "test_set": "in place of both tests",
     "pool": "in place of the pool",
@@ -77,7 +78,7 @@ class Rooms:
         told = {name: value for name, value in asdict(self).items() if name != "folder"}
         for name in FILES:
             path: Path | None = told[name]
-            told[name] = None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
+            told[name] = None if path is None else foreign.digest(path)
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
 
     def load(self) -> Data:
@@ -97,9 +98,16 @@ class Rooms:
 
 def add_files(parser: argparse.ArgumentParser) -> None:
     """Options for which rooms, and for files in the foreign layout."""
-    parser.add_argument("--data-seed", type=int, default=0)
+    parser.add_argument("--data-seed", type=data_seed, default=0, help=f"other rooms, 0 to {MOST_DATA_SEEDS - 1}")
     for name, what in FILES.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=Path, help=f"npz of transitions, {what}")
+
+
+def data_seed(text: str) -> int:
+    """From the command line. Beyond the bound lie the rooms of other figures, further on those for tuning."""
+    if not text.isdecimal() or int(text) >= MOST_DATA_SEEDS:
+        raise argparse.ArgumentTypeError(f"must be 0 to {MOST_DATA_SEEDS - 1}, got {text!r}")
+    return int(text)
 
 
 @cache
