@@ -47,6 +47,19 @@ class Explorations:
     actions: Tensor
     scores: Tensor
 
+    def take(self, rows: Tensor) -> "Explorations":
+        """Some of them: int64 places, or bool (M,)."""
+        return Explorations(self.states[rows], self.actions[rows], self.scores[rows])
+
+
+def distinct(observations: Observations) -> Tensor:
+    """The first row of each different observation of (B, ...): int64, in order. Rooms that look the same are one."""
+    rows = torch.cat([stream.flatten(1).cpu() for stream in observations.values()], 1).numpy()
+    first = dict[bytes, int]()
+    for number, row in enumerate(rows):
+        first.setdefault(row.tobytes(), number)
+    return torch.tensor(list(first.values()), dtype=torch.int64)
+
 
 @torch.inference_mode()
 def explore(
@@ -98,9 +111,11 @@ def order(
 ) -> Tensor:
     """Rows of `found` that have the `count` highest scores, so ordered that every prefix is a good batch.
 
-    observations: the states (B, ...) that `explore` was given.
+    Of each state only the best is among them: several actions there may have no effect, whatever the world model
+    expects, and that is one trajectory and one label. observations: the states (B, ...) that `explore` was given.
     """
-    best = top(found.scores, count)
+    best = _best_of_each(found)
+    best = best[top(found.scores[best], count)]
     world_model = models.world_model
     candidates = Candidates(found.scores[best])
     if rule.reads is not None and world_model is not None and len(best):
@@ -175,6 +190,14 @@ def _listed(actions: Tensor, scores: Tensor) -> Explorations:
     """(B, n, K), (B, n) -> one row an action, on the CPU."""
     states = torch.arange(len(actions)).repeat_interleave(actions.shape[1])
     return Explorations(states, actions.flatten(0, 1).cpu(), scores.flatten().cpu())
+
+
+def _best_of_each(found: Explorations) -> Tensor:
+    """Rows of `found`, of each state the one with the highest score, of equal ones the first: int64, in order."""
+    best = found.scores.argsort(descending=True, stable=True)
+    count = int(found.states.max()) + 1 if len(best) else 0
+    first = torch.full((count,), len(best)).scatter_reduce(0, found.states[best], torch.arange(len(best)), "amin")
+    return best[first[first < len(best)]].sort().values
 
 
 def _log_prob(log_prob: Tensor, actions: Tensor) -> Tensor:

@@ -58,14 +58,19 @@ class States:
         return _segment(project, self.members, self.ends, place)
 
 
-def states(session: Session, project: ProjectRow) -> States:
+def states(session: Session, project: ProjectRow, last: int | None = None) -> States:
     """What can be explored from. It takes a while in a large pool, and needs no lock: members stay.
 
-    Where the project has a simulator only trajectories whose simulator states are kept can be gone back to.
+    Where the project has a simulator only trajectories whose simulator states are kept can be gone back to. last: the
+    pool as it was when this membership was the youngest.
     """
-    simulated = projects.environment_of(project).simulator is not None
-    members = queries.members(session, project.id, "pool", with_provenance=simulated)
+    members = queries.members(session, project.id, "pool", with_provenance=_simulated(project), last=last)
     return States(members, np.cumsum([member.segments for member in members], dtype=np.int64))
+
+
+def explorable(session: Session, project: ProjectRow) -> bool:
+    """Whether there is any such state. It costs one look."""
+    return queries.is_any(session, project.id, "pool", with_provenance=_simulated(project))
 
 
 def explorations(project: ProjectRow, states: States, count: int) -> list[Candidate]:
@@ -76,6 +81,10 @@ def explorations(project: ProjectRow, states: States, count: int) -> list[Candid
     places = rng.integers(0, states.count, count)
     segments = [states.at(project, int(place)) for place in places]
     return [Candidate(*segment, actions=_actions(project, rng)) for segment in segments]
+
+
+def _simulated(project: ProjectRow) -> bool:
+    return projects.environment_of(project).simulator is not None
 
 
 def _segment(

@@ -146,6 +146,18 @@ class NothingToExplore(ServiceError):
         super().__init__(f"mode: project {project} has no {missing} in its pool that an exploration could start from")
 
 
+class AllExplored(ServiceError):
+    """What a strategy can propose under a round's models has all been given out."""
+
+    status_code = 409
+
+    def __init__(self, project: UUID, strategy: str, round_number: int) -> None:
+        super().__init__(
+            f"mode: all that {strategy} finds to explore in the pool of project {project} under the models of round "
+            f"{round_number} has been given out; more comes with the next round or with more trajectories"
+        )
+
+
 class BudgetExhausted(ServiceError):
     """The project's label budget does not cover this."""
 

@@ -1,7 +1,8 @@
 """Proposals: explorations that a strategy chooses under the current round's models, kept ready in a queue of their own.
 
 They come of a scoring in mode `explore`: one job draws states of the pool, imagines futures there and queues what is
-most worth executing. Each is given out once; when all are, the job runs again and draws other states.
+most worth executing. Each is given out once; when all are, the job runs again, draws other states and leaves out what
+was given out under the round's models, or came back labeled under any.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from sqlalchemy.orm import Session
 from api_schemas.jobs import ProposeExplorations, TrainRound
 from api_schemas.strategies import CATALOG
 from service import draws, jobs, projects, scorings
-from service.errors import NothingToExplore
+from service.errors import AllExplored, NothingToExplore
 from service.scorings import NEEDS, PREVIOUS, Limits
 from service.store.queries import acquisitions as queries
 from service.store.queries import jobs as job_queries
@@ -44,7 +45,8 @@ def take(
 ) -> tuple[ScoringRow, Sequence[QueueRow]] | JobRow:
     """The best `count` proposals, or as many as are left, which are then nobody else's; or the job that makes some.
 
-    Call it under the project's lock. Raises NothingToExplore where no state of the pool can be gone back to.
+    Call it under the project's lock. Raises NothingToExplore where no state of the pool can be gone back to,
+    AllExplored where all that can be proposed has been given out.
     """
     scoring = queries.newest_scoring(session, project.id, strategy, round_row.id, mode="explore")
     if scoring is None:
@@ -52,7 +54,7 @@ def take(
     scoring = scorings.find(session, scoring.id, lock=True)  # no job replaces the queue between reading and dropping
     found = queries.explorations(session, scoring, count) if scoring.status == "ready" else []
     if not found:
-        return _propose(session, project, scoring, count, now, limits)
+        return _propose(session, project, scoring, round_row, count, now, limits)
     queries.drop_explorations(session, scoring, [row.rank for row in found])
     return scoring, found
 
@@ -79,16 +81,26 @@ def _request(
     session.add(scoring)
     session.flush()
     scorings.tell(session, scoring, "started", now)
-    return _propose(session, project, scoring, count, now, limits)
+    return _propose(session, project, scoring, round_row, count, now, limits)
 
 
 def _propose(
-    session: Session, project: ProjectRow, scoring: ScoringRow, count: int, now: datetime, limits: Limits
+    session: Session,
+    project: ProjectRow,
+    scoring: ScoringRow,
+    round_row: RoundRow,
+    count: int,
+    now: datetime,
+    limits: Limits,
 ) -> JobRow:
     waiting = job_queries.unfinished(session, scoring.id)
     if waiting is not None:
         return waiting
-    if not draws.states(session, project).count:
+    if not draws.explorable(session, project):
         raise NothingToExplore(project.id, projects.environment_of(project).simulator)
+    members, last = pool_queries.newest_membership(session, project.id, "pool"), job_queries.newest(session, scoring.id)
+    if last is not None and last.result.get("queued") == 0 and members == scoring.memberships:
+        raise AllExplored(project.id, scoring.strategy, round_row.number)
+    scoring.memberships = members  # the pool that the job draws from, however often it runs
     payload = ProposeExplorations(scoring=scoring.id, length=max(limits.queue_length, count))
     return jobs.enqueue(session, project.id, payload, scoring.id, now, limits.max_attempts)

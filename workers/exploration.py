@@ -6,13 +6,13 @@ from uuid import UUID
 import torch
 from sqlalchemy.orm import Session
 
-from api_schemas.labels import Action
 from models.acquisition import BATCH_RULES, EXPLORING, Cycle, Models
 from models.chance import scoring_generator
-from models.exploration import STATES, Explorations, explore, order
+from models.exploration import STATES, Explorations, distinct, explore, order
 from models.segments import at
 from service import draws, projects, proposals, rounds, scorings
 from service.scorings import Ranked
+from service.store.queries import acquisitions as acquisition_queries
 from service.store.queries import pool as pool_queries
 from service.store.tables import ModelVersionRow, ProjectRow, ScoringRow
 from workers import data
@@ -24,11 +24,15 @@ from workers.scoring import load_models
 
 @dataclass(frozen=True)
 class Plan:
-    """What one job proposes from: states (trajectory, observation), where their content is, networks, chance."""
+    """What one job proposes from: states (trajectory, observation), where their content is, networks, chance.
+
+    explored: what is not proposed again, states with actions.
+    """
 
     project: ProjectRow
     scoring: ScoringRow
     states: list[tuple[str, int]]
+    explored: set[tuple[str, int, tuple[object, ...]]]
     windows: list[data.Windows]
     subgoal_generator: ModelVersionRow
     generator: torch.Generator
@@ -37,6 +41,16 @@ class Plan:
     def strategy(self) -> Cycle:
         """Who proposes."""
         return EXPLORING[self.scoring.strategy]
+
+    def at(self, rows: torch.Tensor) -> "Plan":
+        """With some of the states alone."""
+        return replace(self, states=[self.states[row] for row in rows.tolist()])
+
+    def new(self, found: Explorations) -> Explorations:
+        """Those that nobody was asked to execute yet."""
+        proposed = zip(found.states.tolist(), found.actions.tolist(), strict=True)
+        kept = [(*self.states[state], tuple(actions)) not in self.explored for state, actions in proposed]
+        return found.take(torch.tensor(kept, dtype=torch.bool))
 
 
 def run_proposals(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, object]:
@@ -48,10 +62,7 @@ def run_proposals(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, o
         plan = _plan(session, scoring_id)
     if plan is None:
         return {"queued": 0}
-    order, found = _ordered(job, plan, length)
-    ranked = [
-        Ranked(*plan.states[int(found.states[i])], float(found.scores[i]), _listed(found.actions[i])) for i in order
-    ]
+    ranked = _ranked(job, plan, length)
     with job.transaction() as session:
         scorings.publish(session, scoring_id, ranked, job.now())
     return {"queued": len(ranked), "states": len(plan.states)}
@@ -66,27 +77,31 @@ def _plan(session: Session, scoring_id: UUID) -> Plan | None:
     subgoal_generator = proposals.generator_of(session, round_row)
     if scoring.status == "failed" or subgoal_generator is None:
         return None
-    what = f"exploration {scoring.selections}"
+    what = f"exploration {acquisition_queries.times_proposed(session, scoring)}"
     members = pool_queries.memberships(session, project.id, "pool", last=scoring.memberships)
     generator = scoring_generator(project.seed, scoring.strategy, round_row.number, len(members), what)
-    there = draws.states(session, project)
+    there = draws.states(session, project, last=scoring.memberships)
     states = [there.at(project, place) for place in draw_places(there.count, [], STATES, generator)]
     contents = pool_queries.contents(session, sorted({trajectory for trajectory, _ in states}))
     windows = [data.Windows(name, contents[name].blob_sha256, (start,)) for name, start in states]
-    return Plan(project, scoring, states, windows, subgoal_generator, generator)
+    explored = acquisition_queries.explored(session, project.id, scoring.round_id)
+    return Plan(project, scoring, states, explored, windows, subgoal_generator, generator)
 
 
-def _ordered(job: RunningJob, plan: Plan, length: int) -> tuple[list[int], Explorations]:
-    """The `length` best explorations as the policy's batch rule orders them, and all that were scored."""
+def _ranked(job: RunningJob, plan: Plan, length: int) -> list[Ranked]:
+    """The `length` best new explorations as the policy's batch rule orders them."""
     strategy, project, blobs = plan.strategy, plan.project, job.worker.blobs
     models = _models(job, plan)
     seen = data.load_in_order(blobs, plan.windows, project.segment_length, job.go_on)
-    states = at(seen.observations, 0)  # what was observed next is another strategy's business
+    rooms = distinct(at(seen.observations, 0))  # what was observed next is another strategy's business
+    states, plan = at(seen.take(rooms).observations, 0), plan.at(rooms)
     job.report(0.2, f"imagining futures of {len(plan.states)} states")
-    found = explore(strategy, models, states, project.segment_length, plan.generator, after_each=job.go_on)
+    found = plan.new(explore(strategy, models, states, project.segment_length, plan.generator, after_each=job.go_on))
     rule = BATCH_RULES[projects.policy_of(project).batch_rule]
     job.report(0.9, f"ordering {len(found.scores)} explorations by {rule.name}")
-    return order(rule, models, states, found, length, plan.generator).tolist(), found
+    chosen = found.take(order(rule, models, states, found, length, plan.generator))
+    proposed = zip(chosen.states.tolist(), chosen.scores.tolist(), chosen.actions.tolist(), strict=True)
+    return [Ranked(*plan.states[int(state)], score, actions) for state, score, actions in proposed]
 
 
 def _models(job: RunningJob, plan: Plan) -> Models:
@@ -95,9 +110,3 @@ def _models(job: RunningJob, plan: Plan) -> Models:
     models = load_models(worker.database, worker.blobs, plan.project, plan.scoring.round_id, needs)
     generator = load_network(worker.blobs, plan.subgoal_generator, plan.project)
     return replace(models, subgoal_generator=generator)  # type: ignore[arg-type]  # the checkpoint's kind was checked
-
-
-def _listed(actions: torch.Tensor) -> list[Action]:
-    """(K,) or (K, D) as the API and the database have actions."""
-    listed: list[Action] = actions.tolist()
-    return listed

@@ -5,15 +5,10 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from uuid import UUID
 
 import pytest
-from alembic import command
-from alembic.autogenerate import compare_metadata
-from alembic.config import Config
-from alembic.migration import MigrationContext
-from sqlalchemy import Engine, create_engine, inspect, pool, select, text
+from sqlalchemy import Engine, select, text
 from sqlalchemy.exc import DBAPIError
 
 from service import projects
@@ -23,6 +18,15 @@ from service.store.database import migrate, open_database
 from service.store.tables import EventEpochRow, ProjectRow
 from tests.service.first_schema import EMPTY, FIRST, NAMES, SECOND, fill, narrowed, read, write
 from tests.service.kit import Served, serve
+from tests.service.migrating import (
+    check_references,
+    differences,
+    downgrade,
+    engine_of,
+    schema_of,
+    tables,
+    version,
+)
 
 COUNTERS = {
     FIRST: {"pool_trajectories": 2, "pool_segments": 12, "held_out_trajectories": 1, "held_out_segments": 4},
@@ -39,53 +43,6 @@ op.batch_alter_table = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)  # 
 """
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    if request.param == "sqlite":
-        return f"sqlite:///{tmp_path / 'fresh.db'}"
-    return str(request.getfixturevalue("postgres_url"))
-
-
-def _engine(url: str) -> Engine:
-    return create_engine(url, poolclass=pool.NullPool)
-
-
-def _differences(url: str) -> list[object]:
-    with _engine(url).connect() as connection:
-        options = {"compare_type": True, "compare_server_default": True}
-        return list(compare_metadata(MigrationContext.configure(connection, opts=options), Row.metadata))
-
-
-def _tables(url: str) -> set[str]:
-    return set(inspect(_engine(url)).get_table_names())
-
-
-def _version(url: str) -> str | None:
-    with _engine(url).connect() as connection:
-        return MigrationContext.configure(connection).get_current_revision()
-
-
-def _schema(url: str) -> dict[str, Any]:
-    """Columns, keys and indexes of all tables, to be compared."""
-    looked = inspect(_engine(url))
-
-    def told(table: str) -> list[Any]:
-        columns = [f"{each['name']} {each['type']} {each['nullable']}" for each in looked.get_columns(table)]
-        indexes = [f"{each['name']} {each['column_names']} {each['unique']}" for each in looked.get_indexes(table)]
-        keys = [f"{each['constrained_columns']} {each['referred_table']}" for each in looked.get_foreign_keys(table)]
-        return [sorted(columns), sorted(indexes), sorted(keys), list(looked.get_pk_constraint(table).values())[:1]]
-
-    return {table: told(table) for table in sorted(looked.get_table_names())}
-
-
-def _downgrade(url: str, revision: str) -> None:
-    config = Config()
-    config.set_main_option("script_location", "service.store:migrations")
-    config.set_main_option("path_separator", "os")
-    config.attributes["url"] = url
-    command.downgrade(config, revision)
-
-
 def _process(code: str, url: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", code, url], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
@@ -99,30 +56,22 @@ def _ended(process: subprocess.Popen[bytes]) -> int:
     return process.returncode
 
 
-def _check_references(url: str) -> None:
-    """SQLite does not look while tables are made anew."""
-    if url.startswith("sqlite"):
-        with _engine(url).connect() as connection:
-            assert connection.exec_driver_sql("PRAGMA foreign_key_check").all() == []
-            assert connection.exec_driver_sql("PRAGMA integrity_check").scalar() == "ok"
-
-
 def test_up_down_and_up_again_is_what_the_tables_say(url: str) -> None:
     migrate(url)
-    assert _differences(url) == []
-    assert _tables(url) == {*Row.metadata.tables, "alembic_version"}
+    assert differences(url) == []
+    assert tables(url) == {*Row.metadata.tables, "alembic_version"}
     migrate(url)  # the newest already
-    _downgrade(url, "base")
-    assert _tables(url) == {"alembic_version"}
+    downgrade(url, "base")
+    assert tables(url) == {"alembic_version"}
     migrate(url)
-    assert _differences(url) == []
+    assert differences(url) == []
 
 
 def test_the_first_schema_is_upgraded_with_its_data_and_counted(url: str) -> None:
     migrate(url, "0001")
     before = fill(url)
     migrate(url)
-    assert _differences(url) == []
+    assert differences(url) == []
     after = read(url)
     assert narrowed(after, before) == before
     for row in after["project"]:
@@ -135,7 +84,7 @@ def test_the_first_schema_is_upgraded_with_its_data_and_counted(url: str) -> Non
     assert {row["diagnostics"] for row in after["round"]} == {None}
     assert after["idempotency"] == []
     assert _rules(url) == {FIRST: "kmeans_plus_plus", SECOND: "top", EMPTY: "top"}
-    _check_references(url)
+    check_references(url)
 
 
 def test_the_tables_read_every_row_of_an_upgraded_database(url: str) -> None:
@@ -198,11 +147,11 @@ def _rules(url: str) -> dict[UUID, str]:
 
 def test_going_back_keeps_all_that_the_first_schema_knows(url: str) -> None:
     migrate(url, "0001")
-    before, schema = fill(url), _schema(url)
+    before, schema = fill(url), schema_of(url)
     migrate(url)
-    _downgrade(url, "0001")
-    assert (_version(url), _schema(url), read(url)) == ("0001", schema, before)
-    _check_references(url)
+    downgrade(url, "0001")
+    assert (version(url), schema_of(url), read(url)) == ("0001", schema, before)
+    check_references(url)
     migrate(url)
     assert narrowed(read(url), before) == before
 
@@ -224,7 +173,7 @@ def test_going_back_says_what_is_new_in_the_first_schemas_words(url: str) -> Non
         "INSERT INTO idempotency (caller, route, key, request_sha256, expires_at) "
         "VALUES ('local', 'POST /labels', 'k', 'x', '2030-01-01 00:00:00')",
     )
-    _downgrade(url, "0001")
+    downgrade(url, "0001")
     after = read(url)
     states = {row["id"]: row["state"] for row in after["job"]}
     assert states.pop(job.hex) == "failed"
@@ -235,119 +184,51 @@ def test_going_back_says_what_is_new_in_the_first_schemas_words(url: str) -> Non
     assert labeled.hex not in statuses
     assert labeled.hex not in {row["acquisition_id"] for row in after["acquisition_item"]}
     assert after["label"] == before["label"]  # also those that the forgotten acquisition brought
-    _check_references(url)
+    check_references(url)
     migrate(url)
-    assert _differences(url) == []
-
-
-def test_going_back_before_the_diagnostics_forgets_them_alone(url: str) -> None:
-    migrate(url, "0001")
-    fill(url)
-    migrate(url, "0003")
-    before, schema = read(url), _schema(url)
-    migrate(url, "0004")
-    filled = {name: rows for name, rows in before.items() if rows}
-    assert narrowed(read(url), filled) == filled
-    write(url, """UPDATE round SET diagnostics = '{"sampled": 7}'""")
-    assert [row["diagnostics"] for row in read(url)["round"]] == 2 * [{"sampled": 7}]
-    _downgrade(url, "0003")
-    assert (_version(url), _schema(url), read(url)) == ("0003", schema, before)
-    _check_references(url)
-    migrate(url)
-    assert _differences(url) == []
-
-
-def test_going_back_before_explorations_forgets_what_was_only_proposed(url: str) -> None:
-    migrate(url, "0001")
-    fill(url)
-    migrate(url, "0005")
-    before, schema = read(url), _schema(url)
-    migrate(url, "0006")
-    assert {row["mode"] for row in read(url)["scoring"]} == {"pool"}
-    assert {row["actions"] for row in read(url)["queue"]} == {None}
-    scored, proposed = (_quoted(url, UUID(int=FIRST.int + more)) for more in (4, 40))
-    columns = "project_id, round_id, strategy, status, memberships, shards, selections, created_at"
-    places = "rank, project_id, trajectory_id, start, score"
-    scoring = f"INSERT INTO scoring (id, mode, {columns}) SELECT '{proposed}', 'explore', {columns} FROM scoring"  # noqa: S608
-    queue = f"INSERT INTO queue (scoring_id, actions, {places}) SELECT '{proposed}', '[6]', {places} FROM queue"  # noqa: S608
-    write(
-        url,
-        f"{scoring} WHERE id = '{scored}'",
-        f"{queue} WHERE scoring_id = '{scored}'",
-        "UPDATE job SET kind = 'propose_explorations' WHERE state = 'queued'",
-    )
-    assert len(read(url)["queue"]) == len(before["queue"]) + 1
-    _downgrade(url, "0005")
-    after = read(url)
-    assert (_version(url), _schema(url)) == ("0005", schema)
-    assert [row["kind"] for row in after.pop("job")] == ["train_round", "train_round"]  # those that were done
-    assert after == {name: rows for name, rows in before.items() if name != "job"}
-    _check_references(url)
-    migrate(url)
-    assert _differences(url) == []
-
-
-def test_confidence_comes_and_goes_with_its_migration(url: str) -> None:
-    migrate(url, "0001")
-    fill(url)
-    migrate(url, "0006")
-    before, schema = read(url), _schema(url)
-    migrate(url, "0007")
-    for table in ("queue", "acquisition_item"):
-        assert {row["confidence"] for row in read(url)[table]} == {None}
-        write(url, f"UPDATE {table} SET confidence = 0.5")  # noqa: S608
-    _downgrade(url, "0006")
-    assert (_version(url), _schema(url), read(url)) == ("0006", schema, before)
-    _check_references(url)
-    migrate(url)
-    assert _differences(url) == []
-
-
-def _quoted(url: str, name: UUID) -> str:
-    """As the database writes it."""
-    return str(name) if "postgresql" in url else name.hex
+    assert differences(url) == []
 
 
 def test_a_migration_that_fails_in_the_middle_changes_nothing(url: str) -> None:
     migrate(url, "0001")
     write(url, "ALTER TABLE job ADD COLUMN checkpoint_stage VARCHAR(60)")  # the last column that the migration adds
-    before, schema = fill(url), _schema(url)
+    before, schema = fill(url), schema_of(url)
     with pytest.raises(DBAPIError, match="checkpoint_stage"):
         migrate(url)
-    assert (_version(url), _schema(url), read(url)) == ("0001", schema, before)
+    assert (version(url), schema_of(url), read(url)) == ("0001", schema, before)
     write(url, "ALTER TABLE job DROP COLUMN checkpoint_stage")
     migrate(url)
-    assert _differences(url) == []
+    assert differences(url) == []
 
 
 def test_a_migration_that_is_killed_in_the_middle_changes_nothing(url: str) -> None:
     migrate(url, "0001")
-    before, schema = fill(url), _schema(url)
+    before, schema = fill(url), schema_of(url)
     assert _ended(_process(KILLED, url)) == -9
-    assert (_version(url), _schema(url), read(url)) == ("0001", schema, before)
+    assert (version(url), schema_of(url), read(url)) == ("0001", schema, before)
     migrate(url)
-    assert _differences(url) == []
+    assert differences(url) == []
     assert narrowed(read(url), before) == before
 
 
 def test_processes_that_migrate_at_once_take_turns(postgres_url: str) -> None:
     migrate(postgres_url, "0001")
     before = fill(postgres_url)
-    engine = _engine(postgres_url)
+    engine = engine_of(postgres_url)
     with engine.begin() as connection:
         connection.execute(text("LOCK TABLE job IN ACCESS SHARE MODE"))  # holds the first one in the middle
         processes = [_process(MIGRATE, postgres_url) for _ in range(2)]
         _until(lambda: _waiting(engine) == 2)
         assert {process.poll() for process in processes} == {None}
     assert [_ended(process) for process in processes] == [0, 0]
-    assert _differences(postgres_url) == []
+    assert differences(postgres_url) == []
     assert narrowed(read(postgres_url), before) == before
 
 
 def test_processes_that_make_an_empty_database_at_once_take_turns(url: str) -> None:
     processes = [_process(MIGRATE, url) for _ in range(2)]
     assert [_ended(process) for process in processes] == [0, 0]
-    assert _differences(url) == []
+    assert differences(url) == []
 
 
 def _waiting(engine: Engine) -> int:

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from api_schemas.acquisitions import Acquisition
-from asim.errors import NotReady
+from asim.errors import Conflict, NotReady
 from models import checkpoints
 from models.acquisition import EXPLORING, STRATEGIES
-from models.exploration import explore
+from models.exploration import distinct, explore
 from models.segments import at
 from models.subgoal_generators.base import SubgoalGenerator
 from service.store.queries import pool as pool_queries
@@ -65,15 +65,18 @@ def test_proposals_have_the_scores_of_the_strategy_on_the_rounds_networks(traine
     subgoals = checkpoints.load(trained.blobs.get("weights", generator.sha256))
     models = replace(models, subgoal_generator=cast(SubgoalGenerator, subgoals))
     batch = data.load(trained.blobs, windows, 1)
+    batch = batch.take(distinct(at(batch.observations, 0)))  # of rooms that look the same, one
     found = explore(EXPLORING["confident_cycle"], models, at(batch.observations, 0), 1, torch.Generator())
     names = [batch.segments[int(row)] for row in found.states]
     direct = {
         (name.trajectory, name.start, tuple(actions)): score
         for name, actions, score in zip(names, found.actions.tolist(), found.scores.tolist(), strict=True)
     }
-    assert len(direct) == 600 * 7
-    ranked = queued(trained)
-    assert len(ranked) == min(len(direct), trained.settings.queue_length)
+    assert 300 < batch.size < 600
+    assert len(direct) == batch.size * 7
+    ranked = queued(trained)  # in each room the best action
+    assert {key[:2] for key, _ in ranked} == {tuple(name) for name in batch.segments}
+    assert len(ranked) == batch.size
     expected = [direct[key] for key, _ in ranked]
     np.testing.assert_allclose([score or 0.0 for _, score in ranked], expected, rtol=1e-3, atol=1e-3)
 
@@ -93,8 +96,6 @@ def test_a_proposal_is_given_out_once_and_others_follow(opened: OpenLoop, traine
 
 
 def test_the_labeling_worker_executes_what_is_proposed(trained: Loop) -> None:
-    # Spread in latent space: two actions without effect in the same room would be one trajectory, and one label.
-    trained.change(batch_rule="kmeans_plus_plus")
     batch = trained.acquire(12, mode="explore")
     before = trained.project.counts.labeled
     run_labeling(trained.client, batch, np.random.default_rng(0))
@@ -153,6 +154,9 @@ def test_a_job_that_runs_twice_proposes_the_same(trained: Loop) -> None:
     with trained.worker.database.read() as session:
         (row,) = session.query(ScoringRow).filter_by(mode="explore").all()
     trained.set_row("scoring", row.id, selections=0, status="scoring")  # as if it had crashed before its last write
+    with trained.worker.database.write() as session:
+        session.query(QueueRow).filter_by(scoring_id=row.id).delete()
+    assert queued(trained) == []
     trained.requeue(job.id)
     trained.drain()
     assert queued(trained) == before
@@ -165,3 +169,35 @@ def test_a_cancelled_job_is_asked_for_anew(trained: Loop) -> None:
     assert trained.client.round(trained.project.current_round or trained.project.id).status == "current"
     assert trained.acquire(2, mode="explore").strategy == "confident_cycle"
     assert len(trained.jobs("propose_explorations")) == 2
+
+
+def test_after_a_cancelled_job_other_states_are_drawn_than_before(
+    opened: OpenLoop, trained_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.exploration.STATES", 20)
+    trained = opened(trained_folder, queue_length=10)
+    first = trained.acquire(10, mode="explore")
+    with pytest.raises(NotReady):
+        trained.client.acquire(trained.project.id, 10, mode="explore", wait=0)
+    trained.cancel(trained.jobs("propose_explorations")[-1].id)
+    second = trained.acquire(10, mode="explore")
+    states = [{(item.trajectory, item.start) for item in batch.items} for batch in (first, second)]
+    assert len(states[0] | states[1]) > len(states[0]) + 5  # 10 of 600 are hardly ever drawn again
+
+
+def test_what_was_given_out_is_not_proposed_again_and_in_the_end_there_is_nothing(
+    opened: OpenLoop, trained_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.exploration.STATES", 10**6)
+    trained = opened(trained_folder)
+    asked: list[Proposal] = []
+
+    def ask_for_all() -> None:
+        while True:
+            asked.extend(proposals(trained.acquire(450, mode="explore")))
+
+    with pytest.raises(Conflict, match=r"all that confident_cycle finds to explore .* has been given out"):
+        ask_for_all()
+    rooms = {proposal[:2] for proposal in asked}
+    assert len(asked) == len(set(asked)) == len(rooms) * 7
+    assert len(trained.jobs("propose_explorations")) == 7 + 1

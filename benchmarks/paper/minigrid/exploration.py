@@ -17,7 +17,7 @@ from benchmarks.paper.minigrid.datasets import ACTIONS, TUNING, DataSpec
 from benchmarks.paper.minigrid.loop import Experiment
 from models.acquisition import EXPLORING, Models
 from models.chance import scoring_generator
-from models.exploration import STATES, explore, order
+from models.exploration import STATES, distinct, explore, order
 from models.segments import Observations, Segment, SegmentBatch, at
 from workers.diagnosis import draw_places
 from workers.explanation import explain
@@ -52,6 +52,7 @@ class Exploration(Experiment):
 
     def _proposed(self, models: Models, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         rows = torch.tensor(draw_places(self.pool.size, [], STATES, generator))
+        rows = rows[distinct(at(self.pool.take(rows).observations, 0))]
         now = at(self.pool.take(rows).observations, 0)
         found = explore(EXPLORING["cycle"], models, now, 1, generator)
         queue = order(self.arm.orders, models, now, found, self.plan.queue_length, generator)

@@ -71,6 +71,24 @@ def _scorings(project_id: UUID, strategy: str, round_id: UUID | None, mode: str 
     return statement.order_by(ScoringRow.created_at.desc())
 
 
+def times_proposed(session: Session, scoring: ScoringRow) -> int:
+    """How often explorations were queued for the strategy under the round, by this scoring and by those before it."""
+    alike = _scorings(scoring.project_id, scoring.strategy, scoring.round_id, "explore").order_by(None)
+    return session.scalar(alike.with_only_columns(func.sum(ScoringRow.selections))) or 0
+
+
+def explored(session: Session, project_id: UUID, round_id: UUID | None) -> set[tuple[str, int, tuple[object, ...]]]:
+    """Trajectory, observation and actions of explorations that were given out under the round, or answered in any."""
+    columns = (AcquisitionItemRow.trajectory_id, AcquisitionItemRow.start, AcquisitionItemRow.actions)
+    statement = select(*columns).join(AcquisitionRow, AcquisitionRow.id == AcquisitionItemRow.acquisition_id)
+    statement = statement.where(
+        AcquisitionRow.project_id == project_id,
+        AcquisitionRow.mode == "explore",
+        or_(AcquisitionItemRow.answer.is_not(None), AcquisitionRow.round_id == round_id),
+    )
+    return {(trajectory, start, tuple(actions or ())) for trajectory, start, actions in session.execute(statement)}
+
+
 class Queued(NamedTuple):
     """A ranked segment as it stands in a queue."""
 

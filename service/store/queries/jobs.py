@@ -37,6 +37,12 @@ def unfinished(session: Session, subject_id: UUID, kind: str | None = None) -> J
     return session.scalar(statement.order_by(JobRow.created_at).limit(1))
 
 
+def newest(session: Session, subject_id: UUID) -> JobRow | None:
+    """The youngest job on the subject."""
+    statement = select(JobRow).where(JobRow.subject_id == subject_id)
+    return session.scalar(statement.order_by(JobRow.created_at.desc()).limit(1))
+
+
 def silent(session: Session, now: datetime) -> JobRow | None:
     """A running job whose lease has ended, if there is one that nobody else has in hand."""
     statement = select(JobRow).where(JobRow.state == "running", JobRow.lease_until <= now)

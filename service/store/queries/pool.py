@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import NamedTuple
 from uuid import UUID
 
-from sqlalchemy import ColumnElement, and_, bindparam, func, select
+from sqlalchemy import ColumnElement, and_, bindparam, exists, func, select
 from sqlalchemy.orm import Session
 
 from api_schemas.base import Split
@@ -74,14 +74,29 @@ def memberships(
     return session.scalars(statement.order_by(MembershipRow.id)).all()
 
 
-def members(session: Session, project_id: UUID, split: str, *, with_provenance: bool = False) -> list[Member]:
-    """Members of a split in the order they came, by two columns; with_provenance: only those with simulator states."""
-    statement = select(MembershipRow.trajectory_id, MembershipRow.segments).where(
-        MembershipRow.project_id == project_id, MembershipRow.split == split
-    )
-    if with_provenance:
-        statement = statement.where(MembershipRow.provenance_sha256.is_not(None))
+def members(
+    session: Session, project_id: UUID, split: str, *, with_provenance: bool = False, last: int | None = None
+) -> list[Member]:
+    """Members of a split in the order they came, up to `last`, by two columns.
+
+    with_provenance: only those with simulator states.
+    """
+    statement = select(MembershipRow.trajectory_id, MembershipRow.segments)
+    statement = statement.where(*_members(project_id, split, with_provenance))
+    if last is not None:
+        statement = statement.where(MembershipRow.id <= last)
     return [Member(name, segments) for name, segments in session.execute(statement.order_by(MembershipRow.id))]
+
+
+def is_any(session: Session, project_id: UUID, split: str, *, with_provenance: bool = False) -> bool:
+    """Whether the split has members that have segments; with_provenance: with simulator states."""
+    there = exists().where(*_members(project_id, split, with_provenance), MembershipRow.segments > 0)
+    return bool(session.scalar(select(there)))
+
+
+def _members(project_id: UUID, split: str, with_provenance: bool) -> list[ColumnElement[bool]]:
+    kept = [MembershipRow.provenance_sha256.is_not(None)] if with_provenance else []
+    return [MembershipRow.project_id == project_id, MembershipRow.split == split, *kept]
 
 
 def sizes(session: Session, project_id: UUID, split: str) -> list[tuple[int, int]]:

@@ -14,7 +14,10 @@ down_revision = "0004"
 branch_labels = None
 depends_on = None
 
+OLDER = ("random", "cycle", "vanilla_cycle", "uncertainty")  # strategies before there were batch rules
+INSTEAD = "cycle"
 PROJECT = sa.table("project", sa.column("id", sa.Uuid()), sa.column("policy", sa.JSON()))
+JOB = sa.table("job", sa.column("id", sa.Uuid()), sa.column("kind", sa.String()), sa.column("payload", sa.JSON()))
 
 
 def upgrade() -> None:
@@ -25,10 +28,34 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
+    """Where a strategy is named that older services do not know, `cycle` takes its place; what it ranked goes.
+
+    Networks that only such a strategy reads are forgotten; their weights stay in the blob store.
+    """
+    _forget_newer_scorings()
+    op.execute("DELETE FROM model_version WHERE kind = 'masked_inverse_dynamics'")
+    for name in ("strategy", "requested_strategy"):
+        op.execute(f"UPDATE acquisition SET {name} = '{INSTEAD}' WHERE {name} NOT IN {OLDER}")  # noqa: S608  # our names
     for project, policy in _policies():
         if "batch_rule" in policy:
             rule = policy.pop("batch_rule")
-            _write(project, policy | {"diversify": rule != "top"})
+            _write(project, policy | {"diversify": rule != "top", "strategy": _older(policy["strategy"])})
+    connection = op.get_bind()
+    for job, payload in connection.execute(sa.select(JOB.c.id, JOB.c.payload).where(JOB.c.kind == "train_round")).all():
+        older = payload | {"strategy": _older(payload["strategy"])}
+        connection.execute(sa.update(JOB).where(JOB.c.id == job).values(payload=older))
+
+
+def _forget_newer_scorings() -> None:
+    newer = f"SELECT id FROM scoring WHERE strategy NOT IN {OLDER}"  # noqa: S608  # our names
+    op.execute(f"DELETE FROM job WHERE subject_id IN ({newer})")  # noqa: S608
+    for table in ("queue", "shard"):
+        op.execute(f"DELETE FROM {table} WHERE scoring_id IN ({newer})")  # noqa: S608
+    op.execute(f"DELETE FROM scoring WHERE strategy NOT IN {OLDER}")  # noqa: S608
+
+
+def _older(strategy: str) -> str:
+    return strategy if strategy in OLDER else INSTEAD
 
 
 def _policies() -> list[tuple[Any, dict[str, Any]]]:
