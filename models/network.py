@@ -10,8 +10,11 @@ from models.segments import SegmentBatch
 from models.spaces import Spaces
 
 KINDS = (
-    *("world_model", "inverse_dynamics", "dense_inverse_dynamics", "masked_inverse_dynamics"),
-    *("subgoal_generator",),
+    "world_model",
+    "inverse_dynamics",
+    "dense_inverse_dynamics",
+    "masked_inverse_dynamics",
+    "subgoal_generator",
 )
 
 

@@ -27,8 +27,12 @@ from workers.stage import Stage
 ENSEMBLE_MEMBERS = 3
 BASE = frozenset({"inverse_dynamics", "world_model"})  # every round has these; model error is theirs
 ORDER = (
-    *("inverse_dynamics", "dense_inverse_dynamics", "masked_inverse_dynamics"),
-    *("world_model", "ensemble", "subgoal_generator"),
+    "inverse_dynamics",
+    "dense_inverse_dynamics",
+    "masked_inverse_dynamics",
+    "world_model",
+    "ensemble",
+    "subgoal_generator",
 )
 SUBGOAL_SEGMENTS = 50_000  # a larger pool is thinned out evenly
 

@@ -63,6 +63,14 @@ class Strategy(Protocol):
         ...
 
 
+class InferredActions:
+    """A strategy that looks at segments under the actions that the sparse inverse dynamics infers."""
+
+    def actions(self: Strategy, models: Models, batch: SegmentBatch) -> Tensor:
+        """The inferred ones: (B, L)."""
+        return given(self, "inverse_dynamics", models.inverse_dynamics).infer(batch.observations)
+
+
 @runtime_checkable
 class PoolStrategy(Protocol):
     """A strategy whose scores depend on those of the whole pool."""

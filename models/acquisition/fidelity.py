@@ -5,22 +5,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.acquisition.base import Models, given
+from models.acquisition.base import InferredActions, Models, given
 from models.segments import SegmentBatch, at, first, future
 
 
 @dataclass(frozen=True)
-class Fidelity:
+class Fidelity(InferredActions):
     """Distance from f(a^ | z_t) to the nearest of `samples` chains of p_phi(. | x_t)."""
 
     name: str = "fidelity"
     privileged: bool = False
     needs: frozenset[str] = frozenset({"world_model", "inverse_dynamics", "subgoal_generator"})
     samples: int = 8
-
-    def actions(self, models: Models, batch: SegmentBatch) -> Tensor:
-        """The inferred ones."""
-        return given(self, "inverse_dynamics", models.inverse_dynamics).infer(batch.observations)
 
     @torch.inference_mode()
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.acquisition.base import Models, given
+from models.acquisition.base import InferredActions, Models, given
 from models.acquisition.reachability import unreachability
 from models.segments import SegmentBatch, first
 from models.spaces import DiscreteAction
 
 
 @dataclass(frozen=True)
-class ForwardCycle:
+class ForwardCycle(InferredActions):
     """Mean over actions of -log h(a | x_t, x^_{t+1}), x^ the prediction of f(z_t, a).
 
     It looks at x_t alone and rolls out one step under every action, which for a discrete space is what sampling many
@@ -22,10 +22,6 @@ class ForwardCycle:
     name: str = "forward_cycle"
     privileged: bool = False
     needs: frozenset[str] = frozenset({"world_model", "inverse_dynamics"})
-
-    def actions(self, models: Models, batch: SegmentBatch) -> Tensor:
-        """The inferred ones."""
-        return given(self, "inverse_dynamics", models.inverse_dynamics).infer(batch.observations)
 
     @torch.inference_mode()
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.acquisition.base import Models, given, labeled
+from models.acquisition.base import InferredActions, Models, given, labeled
 from models.segments import SegmentBatch
 from models.step_distances import nearest_true_actions, rollout_error
 
 
 @dataclass(frozen=True)
-class Progress:
+class Progress(InferredActions):
     """L(theta_old) - L(theta_new) under inferred actions (delta-progress over one round, Kim et al. 2020).
 
     A project's first round has no older model: then it is the loss itself, as in the paper's code.
@@ -20,10 +20,6 @@ class Progress:
     name: str = "progress"
     privileged: bool = False
     needs: frozenset[str] = frozenset({"world_model", "previous_world_model", "inverse_dynamics"})
-
-    def actions(self, models: Models, batch: SegmentBatch) -> Tensor:
-        """The inferred ones."""
-        return given(self, "inverse_dynamics", models.inverse_dynamics).infer(batch.observations)
 
     @torch.inference_mode()
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:

@@ -5,23 +5,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.acquisition.base import Models, given
+from models.acquisition.base import InferredActions, Models, given
 from models.inverse_dynamics.base import DiscreteInverseDynamics
 from models.segments import Observations, SegmentBatch, at, first
 from models.world_models.base import WorldModel
 
 
 @dataclass(frozen=True)
-class Reachability:
+class Reachability(InferredActions):
     """-log h(a^ | x_t, x^_{t+1}), summed over steps: x^ is what the world model predicts of the inferred action."""
 
     name: str = "reachability"
     privileged: bool = False
     needs: frozenset[str] = frozenset({"world_model", "inverse_dynamics"})
-
-    def actions(self, models: Models, batch: SegmentBatch) -> Tensor:
-        """The inferred ones."""
-        return given(self, "inverse_dynamics", models.inverse_dynamics).infer(batch.observations)
 
     @torch.inference_mode()
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:

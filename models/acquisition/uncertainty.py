@@ -5,22 +5,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from models.acquisition.base import Models, given
+from models.acquisition.base import InferredActions, Models
 from models.segments import Observations, SegmentBatch, first
 from models.world_models.base import WorldModel
 
 
 @dataclass(frozen=True)
-class Uncertainty:
+class Uncertainty(InferredActions):
     """A true ensemble: members differ in their initialisation and minibatches. The score never sees x_{t+1} itself."""
 
     name: str = "uncertainty"
     privileged: bool = False
     needs: frozenset[str] = frozenset({"inverse_dynamics", "ensemble"})
-
-    def actions(self, models: Models, batch: SegmentBatch) -> Tensor:
-        """The inferred ones."""
-        return given(self, "inverse_dynamics", models.inverse_dynamics).infer(batch.observations)
 
     @torch.inference_mode()
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:

@@ -7,24 +7,24 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from models.inverse_dynamics.base import negative_log_likelihood
 from models.inverse_dynamics.elements import (
     ElementPairs,
     action_count,
-    element_count,
     element_words,
     one_hot,
     pairs,
     steps,
 )
+from models.inverse_dynamics.grid_base import GridInverseDynamics
 from models.networks import grid as cells
 from models.networks.coordinate_convolution import CoordinateConvolution
 from models.networks.gates import PenaltyRamp, inference_gates, open_probability, sample_gates
 from models.networks.initialisation import initialise, linear, table
 from models.networks.mlp import Mlp
-from models.networks.symmetry import every_turn, turned
+from models.networks.symmetry import turned
 from models.segments import Observations, SegmentBatch
 from models.spaces import Spaces
 
@@ -57,7 +57,7 @@ class MaskedInverseDynamicsConfig:
             raise ValueError(f"over must be 'cells' or 'latent', got {self.over!r}.")
 
 
-class GridCellMaskedInverseDynamics(nn.Module):
+class GridCellMaskedInverseDynamics(GridInverseDynamics):
     """A gate a cell, and slots that each look at one of the open cells; the hand is always read.
 
     Slot k reads sum_c z_c w_kc (x_t, x_{t+1})_c with gates z and attention w_k (softmax over cells), so that the
@@ -66,7 +66,6 @@ class GridCellMaskedInverseDynamics(nn.Module):
     move with the very prediction that is to be verified.
     """
 
-    family = "grid"
     kind = "masked_inverse_dynamics"
 
     def __init__(self, spaces: Spaces, config: MaskedInverseDynamicsConfig, generator: torch.Generator) -> None:
@@ -80,22 +79,9 @@ class GridCellMaskedInverseDynamics(nn.Module):
         self.head = ElementPairs(config.slots + 1, config.hidden, action_count(spaces), config.dropout)
         initialise(self, generator)
 
-    @property
-    def coordinates(self) -> int:
-        """Elements of an observation: cells and the hand."""
-        return element_count(self.spaces)
-
-    def check(self, batch: SegmentBatch) -> None:
-        """Raises ValueError for values outside the vocabulary."""
-        cells.check(batch.observations)
-
     def log_prob(self, batch: SegmentBatch) -> Tensor:
         """(B, L, n)."""
         return self._log_prob(batch.observations)[0]
-
-    def infer(self, observations: Observations) -> Tensor:
-        """The most likely actions, int64 (B, L)."""
-        return self._log_prob(observations)[0].argmax(-1)
 
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """Mean of the labels' negative log-likelihood and the penalty; the generator turns rooms and samples gates."""
@@ -104,10 +90,6 @@ class GridCellMaskedInverseDynamics(nn.Module):
         likelihood = negative_log_likelihood(log_prob, batch).mean()
         loss: Tensor = likelihood + self.penalty() * open_probability(gates).sum(1).mean()
         return loss
-
-    def views(self, batch: SegmentBatch) -> SegmentBatch:
-        """The rooms in all four turns."""
-        return every_turn(batch)
 
     @torch.no_grad()
     def kept(self, observations: Observations) -> Tensor:
@@ -157,13 +139,12 @@ class GridCellMaskedInverseDynamics(nn.Module):
         return logits.log_softmax(-1).view(-1, steps(observations), logits.shape[-1]), gates
 
 
-class GridLatentMaskedInverseDynamics(nn.Module):
+class GridLatentMaskedInverseDynamics(GridInverseDynamics):
     """A gate a coordinate of an encoded frame, the same for all inputs: the form that needs no cells.
 
     Each frame, hand included, is encoded to a vector by the same network; M multiplies both vectors.
     """
 
-    family = "grid"
     kind = "masked_inverse_dynamics"
 
     def __init__(self, spaces: Spaces, config: MaskedInverseDynamicsConfig, generator: torch.Generator) -> None:
@@ -182,17 +163,9 @@ class GridLatentMaskedInverseDynamics(nn.Module):
         """Coordinates of the latent."""
         return self.config.latent
 
-    def check(self, batch: SegmentBatch) -> None:
-        """Raises ValueError for values outside the vocabulary."""
-        cells.check(batch.observations)
-
     def log_prob(self, batch: SegmentBatch) -> Tensor:
         """(B, L, n)."""
         return self._log_prob(batch.observations, inference_gates(self._gates()))
-
-    def infer(self, observations: Observations) -> Tensor:
-        """The most likely actions, int64 (B, L)."""
-        return self._log_prob(observations, inference_gates(self._gates())).argmax(-1)
 
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """Mean of the labels' negative log-likelihood and the penalty; the generator turns rooms and samples gates."""
@@ -202,10 +175,6 @@ class GridLatentMaskedInverseDynamics(nn.Module):
         likelihood = negative_log_likelihood(log_prob, batch).mean()
         loss: Tensor = likelihood + self.penalty() * open_probability(self._gates()).sum()
         return loss
-
-    def views(self, batch: SegmentBatch) -> SegmentBatch:
-        """The rooms in all four turns."""
-        return every_turn(batch)
 
     @torch.no_grad()
     def kept(self, observations: Observations) -> Tensor:

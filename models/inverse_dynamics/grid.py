@@ -3,22 +3,22 @@
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from models.inverse_dynamics.base import negative_log_likelihood
 from models.inverse_dynamics.elements import (
     ElementPairs,
     action_count,
-    element_count,
     element_words,
     one_hot,
     pairs,
     steps,
     touched_elements,
 )
+from models.inverse_dynamics.grid_base import GridInverseDynamics
 from models.networks import grid as cells
 from models.networks.initialisation import initialise
-from models.networks.symmetry import every_turn, turned
+from models.networks.symmetry import turned
 from models.segments import Observations, SegmentBatch
 from models.spaces import Spaces
 
@@ -41,10 +41,9 @@ class DenseInverseDynamicsConfig:
     hidden: int = 64
 
 
-class GridSparseInverseDynamics(nn.Module):
+class GridSparseInverseDynamics(GridInverseDynamics):
     """Reads M*x_t and M*x_{t+1}: the agent's cell and the cell in front of it, both fixed by x_t, and the hand."""
 
-    family = "grid"
     kind = "inverse_dynamics"
 
     def __init__(self, spaces: Spaces, config: SparseInverseDynamicsConfig, generator: torch.Generator) -> None:
@@ -53,22 +52,9 @@ class GridSparseInverseDynamics(nn.Module):
         self.head = ElementPairs(TOUCHED, config.hidden, action_count(spaces), config.dropout)
         initialise(self, generator)
 
-    @property
-    def coordinates(self) -> int:
-        """Elements of an observation: cells and the hand."""
-        return element_count(self.spaces)
-
-    def check(self, batch: SegmentBatch) -> None:
-        """Raises ValueError for values outside the vocabulary."""
-        cells.check(batch.observations)
-
     def log_prob(self, batch: SegmentBatch) -> Tensor:
         """(B, L, n)."""
         return self._log_prob(batch.observations)
-
-    def infer(self, observations: Observations) -> Tensor:
-        """The most likely actions, int64 (B, L)."""
-        return self._log_prob(observations).argmax(-1)
 
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """Mean negative log-likelihood of the labels; the generator turns the rooms and hides channels."""
@@ -79,10 +65,6 @@ class GridSparseInverseDynamics(nn.Module):
         """Elements of each first frame that are read: int64 (B,)."""
         grid = observations["grid"]
         return torch.full((len(grid),), TOUCHED, device=grid.device)
-
-    def views(self, batch: SegmentBatch) -> SegmentBatch:
-        """The rooms in all four turns."""
-        return every_turn(batch)
 
     def verifying_block(self, observations: Observations) -> Tensor:
         """z_S: the channels of the six elements, each one-hot: uint8 (B*L, 6*22)."""
@@ -104,10 +86,9 @@ class GridSparseInverseDynamics(nn.Module):
         return logits.log_softmax(-1).view(-1, steps(observations), logits.shape[-1])
 
 
-class GridDenseInverseDynamics(nn.Module):
+class GridDenseInverseDynamics(GridInverseDynamics):
     """Vanilla inverse dynamics: both whole frames and what is carried through a coordinate convolution network."""
 
-    family = "grid"
     kind = "dense_inverse_dynamics"
 
     def __init__(self, spaces: Spaces, config: DenseInverseDynamicsConfig, generator: torch.Generator) -> None:
@@ -118,22 +99,9 @@ class GridDenseInverseDynamics(nn.Module):
         self.head = cells.PooledHead(size, config.channels, config.hidden, action_count(spaces))
         initialise(self, generator)
 
-    @property
-    def coordinates(self) -> int:
-        """Elements of an observation: cells and the hand."""
-        return element_count(self.spaces)
-
-    def check(self, batch: SegmentBatch) -> None:
-        """Raises ValueError for values outside the vocabulary."""
-        cells.check(batch.observations)
-
     def log_prob(self, batch: SegmentBatch) -> Tensor:
         """(B, L, n)."""
         return self._log_prob(batch.observations)
-
-    def infer(self, observations: Observations) -> Tensor:
-        """The most likely actions, int64 (B, L)."""
-        return self._log_prob(observations).argmax(-1)
 
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """Mean negative log-likelihood of the labels; the generator turns the rooms."""
@@ -143,10 +111,6 @@ class GridDenseInverseDynamics(nn.Module):
         """All elements: int64 (B,)."""
         grid = observations["grid"]
         return torch.full((len(grid),), self.coordinates, device=grid.device)
-
-    def views(self, batch: SegmentBatch) -> SegmentBatch:
-        """The rooms in all four turns."""
-        return every_turn(batch)
 
     def verifying_block(self, observations: Observations) -> Tensor:
         """It reads everything: all cells and the hand of both frames, one-hot: uint8 (B*L, 2*(S*S+1)*22)."""
