@@ -9,7 +9,7 @@ from models.segments import Observations, SegmentBatch
 
 AfterEach = Callable[[], None]  # called after each chunk; may raise to stop
 Describe = Callable[[Observations], Tensor]  # observations (B, L+1, ...) -> vectors (B*L, D), one a step
-CHUNK = 256  # segments on either side of a table of distances: bounds memory whatever the number of labels
+CHUNK = 256  # segments on either side of a table of distances, the largest of what is kept
 
 
 def nearest(

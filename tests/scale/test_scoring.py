@@ -24,7 +24,7 @@ from tests.figures import Figures
 from tests.loop.processes import eventually
 from tests.scale.conftest import Deploy
 
-POOL, TRANSITIONS, SHARD = 200_000, 2500, 12_500  # segments; of a trajectory; segments of a shard
+POOL, TRANSITIONS, SHARD = 600_000, 2500, 37_500  # segments; of a trajectory; segments of a shard
 LABELS_PER_ACTION = 2
 REPEATS, TARGET = 3, 1.7
 LOOK_SECONDS = 0.5

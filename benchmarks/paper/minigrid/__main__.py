@@ -55,6 +55,7 @@ def parts(extent: Extent, out: Path) -> list[Part]:
         Part("inverse_accuracy", "4a"),
         Part("prediction", "prediction", () if extent == "full" else ("--draws", "balanced")),
         Part("predictions", "9"),
+        Part("foreign_path", "foreign"),
         Part("acquisition", "4d", ("--seeds", "10", "--arms", *MANY_SEEDS)),
         Part("acquisition", "4d", ("--seeds", "5", "--arms", *_arms(extent))),
         Part("picked_losses", "8", ("--results", str(out / "4d"))),

@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     # One arm first: it trains the networks that all arms share. Then by seeds: an unfinished run has all arms.
     order = [(seed, asked.arms[0]) for seed in range(asked.seeds)]
     order += [(seed, arm) for seed in range(asked.seeds) for arm in asked.arms[1:]]
-    runs = [ArmRun(arm, seed, rooms, asked.out / "networks" / rooms.identity) for seed, arm in order]
+    runs = [ArmRun(arm, seed, rooms, rooms.networks(asked.out)) for seed, arm in order]
     rooms.load()  # once, before processes ask for it
     run_missing(runs, asked.out, asked.processes, asked.threads)
     # Arms that have finished more seeds before are told with all of them.

@@ -47,6 +47,11 @@ def read(path: Path) -> SegmentBatch:
     )
 
 
+def fits(batch: SegmentBatch) -> torch.Tensor:
+    """Which segments the layout can hold, bool (B,): in all others a full box is carried."""
+    return (batch.observations["carried"][..., 2] == 0).all(1)
+
+
 def digest(path: Path) -> str:
     """Of what the file holds: results on it bear it, so that another file of the same name does not pass for it."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
@@ -59,10 +64,10 @@ def write(batch: SegmentBatch, path: Path) -> None:
     """
     if batch.actions is None or batch.length != 1:
         raise ValueError("The foreign layout holds labeled transitions, one a segment.")
+    unfit = np.flatnonzero(~fits(batch).numpy())
+    if unfit.size:
+        raise ValueError(f"The foreign layout cannot hold segment {unfit[0]}: a full box is carried there.")
     grid, hand = batch.observations["grid"].numpy(), batch.observations["carried"].numpy()
-    full = np.flatnonzero((hand[..., 2] > 0).any(1))
-    if full.size:
-        raise ValueError(f"The foreign layout cannot hold segment {full[0]}: a full box is carried there.")
     arrays = {"states": grid[:, 0], "next_states": grid[:, 1], "carried": hand[:, 0], "next_carried": hand[:, 1]}
     for name in ("states", "next_states"):
         arrays[name] = arrays[name].swapaxes(1, 2)

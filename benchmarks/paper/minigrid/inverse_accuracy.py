@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from benchmarks.figures import Figure, finish
 from benchmarks.paper import charts
@@ -65,24 +66,19 @@ class AccuracyRun:
 
     def results(self) -> Json:
         """Accuracy by action, how much the mask keeps, and what a service would say with the test held out."""
-        labeled, test = self._labeled(), self._test()
-        model = self._trained(labeled)
-        assert test.actions is not None
-        with torch.inference_mode():
-            right = model.infer(test.observations) == test.actions  # (B, 1)
+        labeled, test = self.labeled(), self.test()
+        model = self.trained(labeled)
+        right = inferred_right(model, test)
         known = known_actions(labeled.explanations(ACTIONS), test.explanations(ACTIONS), right)
-        chosen = [right[test.actions == action].double() for action in range(ACTIONS)]
-        accuracy = {
-            name: float(each.mean()) if len(each) else None for name, each in zip(ACTION_NAMES, chosen, strict=True)
-        }
         return {"form": self.form, "draw": self.draw, "labels": self.labels, "seed": self.seed} | {
-            "accuracy": accuracy,
+            "accuracy": by_action(right, test),
             "kept": float(model.kept(test.observations).double().mean()),
             "coordinates": model.coordinates,
             "warnings": list(unknown_actions(known, ACTION_NAMES)),
         }
 
-    def _trained(self, labeled: SegmentBatch) -> DiscreteInverseDynamics:
+    def trained(self, labeled: SegmentBatch) -> DiscreteInverseDynamics:
+        """A new model, trained."""
         kind, config = FORMS[self.form]
         generator = training_generator(self.seed, 1, kind)
         model: DiscreteInverseDynamics = GRID.build(kind, composition.SPACES, config, generator)  # type: ignore[assignment]  # the kind says so
@@ -92,16 +88,31 @@ class AccuracyRun:
     def _first(self) -> int:
         return TUNING if self.tuning else REPORTED
 
-    def _labeled(self) -> SegmentBatch:
+    def labeled(self) -> SegmentBatch:
+        """What it trains on."""
         if self.seed_set is not None:
             return foreign.read(self.seed_set)
         assert self.draw != "given"
         return composition.training_set(self._first() + TRAINING + self.seed, self.labels, self.draw, self.folder)
 
-    def _test(self) -> SegmentBatch:
+    def test(self) -> SegmentBatch:
+        """What it is tested on."""
         if self.test_set is not None:
             return foreign.read(self.test_set)
         return composition.test_set(self._first() + TESTING, self.per_action, self.folder)
+
+
+@torch.inference_mode()
+def inferred_right(model: DiscreteInverseDynamics, test: SegmentBatch) -> Tensor:
+    """Whether the action of each labeled step is inferred: bool (B, 1)."""
+    assert test.actions is not None
+    return model.infer(test.observations) == test.actions
+
+
+def by_action(right: Tensor, test: SegmentBatch) -> dict[str, float | None]:
+    """Share of the steps under each action that are right, None where there is none."""
+    chosen = [right[test.actions == action].double() for action in range(ACTIONS)]
+    return {name: float(each.mean()) if len(each) else None for name, each in zip(ACTION_NAMES, chosen, strict=True)}
 
 
 def main(argv: Sequence[str] | None = None) -> list[Figure]:

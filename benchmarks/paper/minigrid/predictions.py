@@ -94,10 +94,7 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     parser.add_argument("--examples", type=int, default=3)
     asked = parser.parse_args(argv)
     rooms = Rooms.of(asked)
-    runs = [
-        PredictionsRun(arm, asked.seed, asked.examples, rooms, asked.out / "networks" / rooms.identity)
-        for arm in asked.arms
-    ]
+    runs = [PredictionsRun(arm, asked.seed, asked.examples, rooms, rooms.networks(asked.out)) for arm in asked.arms]
     rooms.load()  # once, before processes ask for it
     run_missing(runs, asked.out, asked.processes, asked.threads)
     found = results(runs, asked.out)

@@ -12,6 +12,7 @@ from torch.nn.functional import one_hot
 from benchmarks.paper.minigrid import foreign
 from benchmarks.paper.minigrid.action_following import Outcomes, load_outcomes
 from benchmarks.paper.minigrid.datasets import ACTIONS, REPORTED, TUNING, DataSpec, draw_test_labels, grid_spaces, load
+from benchmarks.paper.runs import code_digest
 from models.segments import SegmentBatch
 from models.spaces import Spaces
 
@@ -80,6 +81,10 @@ class Rooms:
             path: Path | None = told[name]
             told[name] = None if path is None else foreign.digest(path)
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
+
+    def networks(self, out: Path) -> Path:
+        """The folder of the networks that all arms share here: other rooms and other code train others."""
+        return out / "networks" / f"{self.identity}-{code_digest()}"
 
     def load(self) -> Data:
         """From files, made where they are not there yet."""
