@@ -20,7 +20,8 @@ import torch
 Json = dict[str, Any]
 ROOT = Path(__file__).parents[2]
 CODE = ("models", "workers", "benchmarks/paper/minigrid")
-"""What results depend on, but for the modules that only tell them (`*_table.py`)."""
+TELLING = ("_table", "__main__", "picked_losses", "foreign_path")
+"""What results depend on, and how the names of modules end that only tell of them or ask for them."""
 
 
 class Run(Protocol):
@@ -88,7 +89,7 @@ def result_file(out: Path, run: Run) -> Path:
 @cache
 def code_digest() -> str:
     """Of the sources in CODE and of torch: results may differ where it does."""
-    files = sorted(path for folder in CODE for path in (ROOT / folder).rglob("*.py") if "_table" not in path.stem)
+    files = sorted(path for folder in CODE for path in (ROOT / folder).rglob("*.py") if not path.stem.endswith(TELLING))
     digest = hashlib.sha256(torch.__version__.encode())
     for path in files:
         digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes() + b"\0")

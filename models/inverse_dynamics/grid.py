@@ -29,7 +29,7 @@ TOUCHED = 3  # the agent's cell, the one in front, the hand
 class SparseInverseDynamicsConfig:
     """Widths of the two hidden layers; share of an element's channels hidden in training."""
 
-    hidden: int = 64
+    hidden: int = 256
     dropout: float = 0.2
 
 

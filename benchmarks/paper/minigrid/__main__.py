@@ -2,7 +2,7 @@
 
     python -m benchmarks.paper.minigrid             every arm under top-n and the default rule; 90 minutes is the aim
     python -m benchmarks.paper.minigrid --quick     4a and 4d with four arms, 3 seeds; 10 minutes is the aim
-    python -m benchmarks.paper.minigrid --full      every arm under every batch rule
+    python -m benchmarks.paper.minigrid --full      every arm under every batch rule too, 3 seeds
 
 Finished runs are not repeated: a benchmark that was stopped goes on where it was. Status 1 where a target is missed.
 """
@@ -57,7 +57,8 @@ def parts(extent: Extent, out: Path) -> list[Part]:
         Part("predictions", "9"),
         Part("foreign_path", "foreign"),
         Part("acquisition", "4d", ("--seeds", "10", "--arms", *MANY_SEEDS)),
-        Part("acquisition", "4d", ("--seeds", "5", "--arms", *_arms(extent))),
+        Part("acquisition", "4d", ("--seeds", "5", "--arms", *_arms())),
+        *([Part("acquisition", "4d", ("--seeds", "3", "--arms", *_grid()))] if extent == "full" else []),
         Part("picked_losses", "8", ("--results", str(out / "4d"))),
     ]
 
@@ -92,18 +93,23 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     return run(parts(asked.extent or "usual", asked.out), shared, asked.out)
 
 
-def _arms(extent: Extent) -> list[str]:
-    """Every strategy under top-n and the default rule; in full under every rule, controls and explore mode with them.
+def _arms() -> list[str]:
+    """Every strategy and explore mode under top-n and the default rule. What draws at random has no rule."""
+    from benchmarks.paper.minigrid.arms import CHANCE, EXPLORE
+    from models.acquisition import STRATEGIES
 
-    What draws at random has no rule.
-    """
+    scored = [name for name in sorted(STRATEGIES) if name != "random"]
+    explored = [f"{CHANCE}:top", f"{EXPLORE}:{DEFAULT_BATCH_RULE}"]
+    return ["random:top", *(f"{name}:{rule}" for name in scored for rule in ("top", DEFAULT_BATCH_RULE)), *explored]
+
+
+def _grid() -> list[str]:
+    """Every arm that there is under every rule, controls too."""
     from benchmarks.paper.minigrid.arms import ALL, CHANCE
-    from models.acquisition import BATCH_RULES, STRATEGIES
+    from models.acquisition import BATCH_RULES
 
-    full = extent == "full"
-    names, rules = sorted(ALL if full else STRATEGIES), list(BATCH_RULES) if full else ["top", DEFAULT_BATCH_RULE]
-    scored = [f"{name}:{rule}" for name in names if name not in ("random", CHANCE) for rule in rules]
-    return ["random:top", *([f"{CHANCE}:top"] if full else []), *scored]
+    scored = [name for name in sorted(ALL) if name not in ("random", CHANCE)]
+    return ["random:top", f"{CHANCE}:top", *(f"{name}:{rule}" for rule in BATCH_RULES for name in scored)]
 
 
 if __name__ == "__main__":
