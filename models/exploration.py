@@ -15,7 +15,8 @@ world model is not sure: p(x^_a) is what it gives to its likeliest prediction. h
 Without it an action that few labels show is never inferred, so never executed, so never labeled.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
 import torch
@@ -34,6 +35,8 @@ from models.world_models.base import WorldModel
 STATES = 4000
 """Drawn of the pool each time: what is worth executing is at many states, so looking at more of them hardly helps."""
 
+Asked = tuple[bytes, tuple[object, ...]]  # what it looks like there, and the actions
+
 DOUBT = 0.01  # no action is known so well that it leads nowhere else
 RARE = 1e-3  # an action that is inferred less often than this counts as inferred so often
 SHARPNESS = 3.0  # a prediction is sure where it leaves out less than about a third of a nat
@@ -51,14 +54,30 @@ class Explorations:
         """Some of them: int64 places, or bool (M,)."""
         return Explorations(self.states[rows], self.actions[rows], self.scores[rows])
 
+    def without(self, seen: Sequence[bytes], before: AbstractSet[Asked]) -> "Explorations":
+        """Those that were not executed `before` where it looks the same. seen: what each of the states looks like."""
+        proposed = zip(self.states.tolist(), self.actions.tolist(), strict=True)
+        new = [asked(seen[state], actions) not in before for state, actions in proposed]
+        return self.take(torch.tensor(new, dtype=torch.bool))
 
-def distinct(observations: Observations) -> Tensor:
-    """The first row of each different observation of (B, ...): int64, in order. Rooms that look the same are one."""
-    rows = torch.cat([stream.flatten(1).cpu() for stream in observations.values()], 1).numpy()
+
+def looks(observations: Observations) -> list[bytes]:
+    """What the agent sees in each of (B, ...), equal for equals."""
+    rows = torch.cat([observations[name].flatten(1).cpu() for name in sorted(observations)], 1).numpy()
+    return [row.tobytes() for row in rows]
+
+
+def distinct(seen: Sequence[bytes]) -> Tensor:
+    """Where each look is first: int64, in order. Rooms that look the same are one."""
     first = dict[bytes, int]()
-    for number, row in enumerate(rows):
-        first.setdefault(row.tobytes(), number)
+    for place, look in enumerate(seen):
+        first.setdefault(look, place)
     return torch.tensor(list(first.values()), dtype=torch.int64)
+
+
+def asked(look: bytes, actions: Sequence[object]) -> Asked:
+    """An exploration by what it begins with; actions of one number or of several each."""
+    return look, tuple(tuple(each) if isinstance(each, list) else each for each in actions)
 
 
 @torch.inference_mode()

@@ -161,6 +161,11 @@ def at(observations: Observations, step: int) -> Observations:
     return {name: stream[:, step] for name, stream in observations.items()}
 
 
+def take(observations: Observations, rows: Tensor) -> Observations:
+    """Some of (B, ...): int64 places."""
+    return {name: stream[rows] for name, stream in observations.items()}
+
+
 def future(observations: Observations) -> Observations:
     """All observations but the first: (B, L+1, ...) -> (B, L, ...)."""
     return {name: stream[:, 1:] for name, stream in observations.items()}

@@ -68,9 +68,9 @@ def states(session: Session, project: ProjectRow, last: int | None = None) -> St
     return States(members, np.cumsum([member.segments for member in members], dtype=np.int64))
 
 
-def explorable(session: Session, project: ProjectRow) -> bool:
-    """Whether there is any such state. It costs one look."""
-    return queries.is_any(session, project.id, "pool", with_provenance=_simulated(project))
+def newest_explorable(session: Session, project: ProjectRow) -> int:
+    """The youngest membership that holds such states; 0 where none does. It looks from the youngest back."""
+    return queries.newest_membership(session, project.id, "pool", with_provenance=_simulated(project))
 
 
 def explorations(project: ProjectRow, states: States, count: int) -> list[Candidate]:

@@ -17,7 +17,6 @@ from service.errors import AllExplored, NothingToExplore
 from service.scorings import NEEDS, PREVIOUS, Limits
 from service.store.queries import acquisitions as queries
 from service.store.queries import jobs as job_queries
-from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
 from service.store.tables import JobRow, ModelVersionRow, ProjectRow, QueueRow, RoundRow, ScoringRow
 
@@ -55,7 +54,7 @@ def take(
     found = queries.explorations(session, scoring, count) if scoring.status == "ready" else []
     if not found:
         return _propose(session, project, scoring, round_row, count, now, limits)
-    queries.drop_explorations(session, scoring, [row.rank for row in found])
+    queries.drop_explorations(session, project.id, [(row.trajectory_id, row.start) for row in found])
     return scoring, found
 
 
@@ -74,7 +73,7 @@ def _request(
         mode="explore",
         strategy=strategy,
         status="scoring",
-        memberships=pool_queries.newest_membership(session, project.id, "pool"),
+        memberships=draws.newest_explorable(session, project),
         shards=0,
         created_at=now,
     )
@@ -96,11 +95,12 @@ def _propose(
     waiting = job_queries.unfinished(session, scoring.id)
     if waiting is not None:
         return waiting
-    if not draws.explorable(session, project):
+    newest = draws.newest_explorable(session, project)
+    if not newest:
         raise NothingToExplore(project.id, projects.environment_of(project).simulator)
-    members, last = pool_queries.newest_membership(session, project.id, "pool"), job_queries.newest(session, scoring.id)
-    if last is not None and last.result.get("queued") == 0 and members == scoring.memberships:
+    last = job_queries.newest(session, scoring.id)
+    if last is not None and last.result.get("exhausted") and newest == scoring.memberships:
         raise AllExplored(project.id, scoring.strategy, round_row.number)
-    scoring.memberships = members  # the pool that the job draws from, however often it runs
+    scoring.memberships = newest  # the pool that the job draws from, however often it runs
     payload = ProposeExplorations(scoring=scoring.id, length=max(limits.queue_length, count))
     return jobs.enqueue(session, project.id, payload, scoring.id, now, limits.max_attempts)

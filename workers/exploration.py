@@ -1,5 +1,6 @@
 """Proposals of explorations: futures imagined at states of the pool, those most worth executing queued for acquire."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from uuid import UUID
 
@@ -8,8 +9,8 @@ from sqlalchemy.orm import Session
 
 from models.acquisition import BATCH_RULES, EXPLORING, Cycle, Models
 from models.chance import scoring_generator
-from models.exploration import STATES, Explorations, distinct, explore, order
-from models.segments import at
+from models.exploration import STATES, Asked, asked, distinct, explore, looks, order
+from models.segments import Observations, at, take
 from service import draws, projects, proposals, rounds, scorings
 from service.scorings import Ranked
 from service.store.queries import acquisitions as acquisition_queries
@@ -24,16 +25,17 @@ from workers.scoring import load_models
 
 @dataclass(frozen=True)
 class Plan:
-    """What one job proposes from: states (trajectory, observation), where their content is, networks, chance.
+    """What one job proposes from: states (trajectory, observation), those of `total`, networks, chance.
 
-    explored: what is not proposed again, states with actions.
+    explored: what is not proposed again, states with actions. blobs: by trajectory, where its content is.
     """
 
     project: ProjectRow
     scoring: ScoringRow
     states: list[tuple[str, int]]
-    explored: set[tuple[str, int, tuple[object, ...]]]
-    windows: list[data.Windows]
+    total: int
+    explored: list[tuple[str, int, list[object]]]
+    blobs: dict[str, str]
     subgoal_generator: ModelVersionRow
     generator: torch.Generator
 
@@ -42,15 +44,9 @@ class Plan:
         """Who proposes."""
         return EXPLORING[self.scoring.strategy]
 
-    def at(self, rows: torch.Tensor) -> "Plan":
-        """With some of the states alone."""
-        return replace(self, states=[self.states[row] for row in rows.tolist()])
-
-    def new(self, found: Explorations) -> Explorations:
-        """Those that nobody was asked to execute yet."""
-        proposed = zip(found.states.tolist(), found.actions.tolist(), strict=True)
-        kept = [(*self.states[state], tuple(actions)) not in self.explored for state, actions in proposed]
-        return found.take(torch.tensor(kept, dtype=torch.bool))
+    def windows(self, states: Iterable[tuple[str, int]]) -> list[data.Windows]:
+        """Where to read what was observed in them."""
+        return [data.Windows(name, self.blobs[name], (start,)) for name, start in states]
 
 
 def run_proposals(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, object]:
@@ -65,7 +61,8 @@ def run_proposals(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, o
     ranked = _ranked(job, plan, length)
     with job.transaction() as session:
         scorings.publish(session, scoring_id, ranked, job.now())
-    return {"queued": len(ranked), "states": len(plan.states)}
+    exhausted = not ranked and len(plan.states) == plan.total
+    return {"queued": len(ranked), "states": len(plan.states), "exhausted": exhausted}
 
 
 def _plan(session: Session, scoring_id: UUID) -> Plan | None:
@@ -78,30 +75,46 @@ def _plan(session: Session, scoring_id: UUID) -> Plan | None:
     if scoring.status == "failed" or subgoal_generator is None:
         return None
     what = f"exploration {acquisition_queries.times_proposed(session, scoring)}"
-    members = pool_queries.memberships(session, project.id, "pool", last=scoring.memberships)
-    generator = scoring_generator(project.seed, scoring.strategy, round_row.number, len(members), what)
+    members = pool_queries.count_members(session, project.id, "pool", scoring.memberships)
+    generator = scoring_generator(project.seed, scoring.strategy, round_row.number, members, what)
     there = draws.states(session, project, last=scoring.memberships)
     states = [there.at(project, place) for place in draw_places(there.count, [], STATES, generator)]
-    contents = pool_queries.contents(session, sorted({trajectory for trajectory, _ in states}))
-    windows = [data.Windows(name, contents[name].blob_sha256, (start,)) for name, start in states]
     explored = acquisition_queries.explored(session, project.id, scoring.round_id)
-    return Plan(project, scoring, states, explored, windows, subgoal_generator, generator)
+    names = sorted({name for name, _ in states} | {name for name, *_ in explored})
+    blobs = {name: row.blob_sha256 for name, row in pool_queries.contents(session, names).items()}
+    return Plan(project, scoring, states, there.count, explored, blobs, subgoal_generator, generator)
 
 
 def _ranked(job: RunningJob, plan: Plan, length: int) -> list[Ranked]:
     """The `length` best new explorations as the policy's batch rule orders them."""
-    strategy, project, blobs = plan.strategy, plan.project, job.worker.blobs
+    strategy, project, before = plan.strategy, plan.project, _explored(job, plan)
     models = _models(job, plan)
-    seen = data.load_in_order(blobs, plan.windows, project.segment_length, job.go_on)
-    rooms = distinct(at(seen.observations, 0))  # what was observed next is another strategy's business
-    states, plan = at(seen.take(rooms).observations, 0), plan.at(rooms)
-    job.report(0.2, f"imagining futures of {len(plan.states)} states")
-    found = plan.new(explore(strategy, models, states, project.segment_length, plan.generator, after_each=job.go_on))
+    observed = _observed(job, plan, plan.states)
+    rooms = distinct(looks(observed))
+    states, names = take(observed, rooms), [plan.states[int(room)] for room in rooms]
+    job.report(0.2, f"imagining futures of {len(names)} states")
+    found = explore(strategy, models, states, project.segment_length, plan.generator, after_each=job.go_on)
+    found = found.without(looks(states), before)
     rule = BATCH_RULES[projects.policy_of(project).batch_rule]
     job.report(0.9, f"ordering {len(found.scores)} explorations by {rule.name}")
     chosen = found.take(order(rule, models, states, found, length, plan.generator))
     proposed = zip(chosen.states.tolist(), chosen.scores.tolist(), chosen.actions.tolist(), strict=True)
-    return [Ranked(*plan.states[int(state)], score, actions) for state, score, actions in proposed]
+    return [Ranked(*names[int(state)], score=score, actions=actions) for state, score, actions in proposed]
+
+
+def _explored(job: RunningJob, plan: Plan) -> set[Asked]:
+    """What was executed already, by what it looked like there: another state may look the same."""
+    if not plan.explored:
+        return set()
+    seen = looks(_observed(job, plan, [(name, start) for name, start, _ in plan.explored]))
+    return {asked(look, actions) for look, (*_, actions) in zip(seen, plan.explored, strict=True)}
+
+
+def _observed(job: RunningJob, plan: Plan, states: Sequence[tuple[str, int]]) -> Observations:
+    """What was observed in the states: (B, ...). What came next is another strategy's business."""
+    windows = plan.windows(states)
+    batch = data.load_in_order(job.worker.blobs, windows, plan.project.segment_length, job.go_on)
+    return at(batch.observations, 0)
 
 
 def _models(job: RunningJob, plan: Plan) -> Models:

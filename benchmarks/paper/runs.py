@@ -7,11 +7,13 @@ import argparse
 import hashlib
 import json
 import multiprocessing
-import tempfile
+import os
+import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,9 +21,20 @@ import torch
 
 Json = dict[str, Any]
 ROOT = Path(__file__).parents[2]
-CODE = ("models", "workers", "benchmarks/paper/minigrid")
-TELLING = ("_table", "__main__", "picked_losses", "foreign_path")
-"""What results depend on, and how the names of modules end that only tell of them or ask for them."""
+DATA = (
+    "workers/simulators",
+    "workers/episodes.py",
+    "workers/explanation.py",
+    "service/store/codec.py",
+    "benchmarks/paper/minigrid/composition.py",
+    "benchmarks/paper/minigrid/datasets.py",
+)
+"""What the simulator's own sets depend on."""
+CODE = (*DATA, "models", "workers/data.py", "workers/diagnosis.py", "workers/training.py", "benchmarks/paper")
+"""What results depend on."""
+TELLING = ("_table", "__main__", "charts", "drawing", "foreign_path", "picked_losses", "statistics", "through_service")
+"""How the names of modules end that results do not depend on: they tell of them or ask for them."""
+LIBRARIES = ("gymnasium", "minigrid", "numpy", "torch")
 
 
 class Run(Protocol):
@@ -57,7 +70,7 @@ def run_missing(runs: Sequence[Run], out: Path, processes: int, threads: int) ->
     context = multiprocessing.get_context("spawn")
     began = time.monotonic()
     with ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(threads,)) as pool:
-        futures = [pool.submit(do, run, out) for run in missing]
+        futures = [pool.submit(do, run, out, code_digest()) for run in missing]
         try:
             for done, future in enumerate(as_completed(futures), 1):
                 name, seconds = future.result()
@@ -88,24 +101,43 @@ def result_file(out: Path, run: Run) -> Path:
 
 @cache
 def code_digest() -> str:
-    """Of the sources in CODE and of torch: results may differ where it does."""
-    files = sorted(path for folder in CODE for path in (ROOT / folder).rglob("*.py") if not path.stem.endswith(TELLING))
-    digest = hashlib.sha256(torch.__version__.encode())
+    """Of what results depend on: the sources in CODE, Python and the libraries of LIBRARIES."""
+    return sources_digest(*CODE)
+
+
+@cache
+def sources_digest(*names: str) -> str:
+    """Of Python files and folders of them below the root, but for modules that only tell; of Python and LIBRARIES."""
+    files = sorted(path for name in names for path in _sources(ROOT / name) if not path.stem.endswith(TELLING))
+    libraries = [f"{name} {version(name)}" for name in LIBRARIES]
+    digest = hashlib.sha256(" ".join((sys.version, *libraries)).encode())
     for path in files:
         digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
 
 
+def _sources(path: Path) -> list[Path]:
+    return [path] if path.is_file() else list(path.rglob("*.py"))
+
+
 def write_at_once(path: Path, content: bytes) -> None:
     """The whole file or none of it: another process may be writing or reading the same."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".unfinished", delete=False) as file:
-        file.write(content)
-    Path(file.name).replace(path)
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")
+    try:
+        unfinished.write_bytes(content)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
-def do(run: Run, out: Path) -> tuple[str, float]:
-    """A run in this process, its results kept: its name, and how many seconds it took."""
+def do(run: Run, out: Path, code: str | None = None) -> tuple[str, float]:
+    """A run in this process, its results kept: its name, and how many seconds it took.
+
+    code: the digest with which the benchmark began. Raises RuntimeError where the code is another by now.
+    """
+    if code not in (None, code_digest()):
+        raise RuntimeError("The code has changed since the benchmark began; start it again.")
     began = time.monotonic()
     found = run.results()
     seconds = time.monotonic() - began

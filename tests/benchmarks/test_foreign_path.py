@@ -22,7 +22,7 @@ def _barely_trained(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_4d_gives_the_same_numbers(small_rooms: Rooms, tmp_path: Path) -> None:
-    figures = {each.name: each for each in errors_of(small_rooms, 0, tmp_path, Plan(40, 20, 1))}
+    figures = {each.name: each for each in errors_of(small_rooms, 0, tmp_path, tmp_path / "file.npz", Plan(40, 20, 1))}
     assert figures["4d_file_transitions"].value > 50
     assert figures["4d_file_numbers"].value == 5 * 10  # count and four errors, of all, two groups and seven actions
     assert figures["4d_file_largest_difference"].value == 0

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.paper import runs
-from benchmarks.paper.runs import Json, code_digest, result_file, results, run_missing
+from benchmarks.paper.runs import Json, code_digest, do, result_file, results, run_missing, sources_digest
 
 
 @dataclass(frozen=True)
@@ -66,10 +66,10 @@ def test_results_of_other_code_are_not_told_and_made_again(
 def test_the_codes_digest_turns_on_what_results_depend_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runs, "ROOT", tmp_path)
     digests = list[str]()
-    for file in ("models/a.py", "models/a.py", "benchmarks/paper/minigrid/b_table.py", "README.md", "workers/c.py"):
+    for file in ("models/a.py", "models/a.py", "benchmarks/paper/b_table.py", "workers/app.py", "workers/data.py"):
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text(f"x = {len(digests)}")
-        digests.append(code_digest.__wrapped__())
+        digests.append(sources_digest.__wrapped__(*runs.CODE))
     assert digests[0] != digests[1] == digests[2] == digests[3] != digests[4]
 
 
@@ -78,3 +78,11 @@ def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path: Path, log: Path) 
     with pytest.raises(ArithmeticError, match="got -2"):
         run_missing([Count(1, log), Count(-2, log)], out, 1, 1)
     assert [path.name for path in out.iterdir()] == ["count1.json"]
+
+
+def test_code_that_changes_under_a_benchmark_ends_it(tmp_path: Path, log: Path) -> None:
+    """Else results of either code would bear the digest of the later."""
+    with pytest.raises(RuntimeError, match="The code has changed since the benchmark began"):
+        do(Count(1, log), tmp_path, "earlier")
+    assert not log.exists()
+    assert do(Count(1, log), tmp_path, code_digest())[0] == "count1"

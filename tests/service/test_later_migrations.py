@@ -7,7 +7,7 @@ from sqlalchemy import select
 
 from service.store.database import migrate, open_database
 from service.store.tables import ProjectRow
-from tests.service.first_schema import FIRST, fill, narrowed, read, write
+from tests.service.first_schema import EMPTY, FIRST, SECOND, fill, narrowed, read, write
 from tests.service.migrating import check_references, differences, downgrade, quoted, schema_of, version
 
 
@@ -74,10 +74,8 @@ def test_confidence_comes_and_goes_with_its_migration(url: str) -> None:
     assert differences(url) == []
 
 
-OLD_STRATEGIES = {"random", "cycle", "vanilla_cycle", "uncertainty"}
-OLD_MODELS = {"world_model", "inverse_dynamics", "dense_inverse_dynamics", "ensemble", "subgoal_generator"}
 OLD_ERROR = {"transitions", "loss", "dynamics_accuracy", "inverse_accuracy", "by_group"}
-"""What a service of the third schema knows; it refuses anything else."""
+"""What a service of the third schema knows of a model error; it refuses anything else."""
 
 
 def test_going_back_to_the_third_schema_leaves_nothing_that_its_service_does_not_know(url: str) -> None:
@@ -88,6 +86,7 @@ def test_going_back_to_the_third_schema_leaves_nothing_that_its_service_does_not
     error = json.dumps(group | {"by_group": {"movement": group, "interaction": group}})
     payload = json.dumps({"kind": "train_round", "round": str(UUID(int=FIRST.int + 3)), "strategy": "self_inverse"})
     scored = quoted(url, UUID(int=FIRST.int + 4))
+    answer = {"strategy": "confident_cycle", "requested_strategy": "cycle", "items": [{"rank": 0, "confidence": 0.5}]}
     write(
         url,
         f"UPDATE round SET model_error = '{error}' WHERE project_id = '{quoted(url, FIRST)}'",  # noqa: S608
@@ -95,7 +94,9 @@ def test_going_back_to_the_third_schema_leaves_nothing_that_its_service_does_not
         f"UPDATE job SET payload = '{payload}' WHERE state = 'done'",  # noqa: S608
         f"UPDATE job SET subject_id = '{scored}', kind = 'select_queue' WHERE state = 'queued'",  # noqa: S608
         "UPDATE acquisition SET strategy = 'fidelity', requested_strategy = 'confident_cycle' WHERE status = 'labeled'",
-        "UPDATE model_version SET kind = 'masked_inverse_dynamics'",
+        f"UPDATE model_version SET kind = 'masked_inverse_dynamics' WHERE project_id = '{quoted(url, FIRST)}'",  # noqa: S608
+        "INSERT INTO idempotency (caller, route, key, request_sha256, status, body, expires_at) "  # noqa: S608
+        f"VALUES ('local', 'POST /acquire', 'k', 'x', 201, '{json.dumps(answer)}', '2030-01-01 00:00:00')",
     )
     _set_policies(url, {"strategy": "confident_cycle", "batch_rule": "signatures"})
     downgrade(url, "0003")
@@ -103,12 +104,12 @@ def test_going_back_to_the_third_schema_leaves_nothing_that_its_service_does_not
     policies = [row["policy"] for row in after["project"]]
     assert [(each["strategy"], each["diversify"]) for each in policies] == 3 * [("cycle", True)]
     assert not any("batch_rule" in each for each in policies)
-    assert {row["strategy"] for row in after["scoring"]} <= OLD_STRATEGIES
+    assert {row["strategy"] for row in after["scoring"]} == {"cycle"}
     assert {row["project_id"] for row in after["queue"]} == {row["project_id"] for row in after["scoring"]}
     assert len(after["scoring"]) == len(after["shard"]) == len(after["queue"]) == 1  # the other project's
-    for name in ("strategy", "requested_strategy"):
-        assert {row[name] for row in after["acquisition"]} == {"random", "cycle"} if name == "strategy" else {"cycle"}
-    assert {row["kind"] for row in after["model_version"]} <= OLD_MODELS
+    assert {row["requested_strategy"] for row in after["acquisition"]} == {"cycle"}
+    assert {row["strategy"] for row in after["acquisition"]} == {"random", "cycle"}
+    assert [row["kind"] for row in after["model_version"]] == ["world_model"]  # the other project's
     assert {row["payload"]["strategy"] for row in after["job"]} == {"cycle"}
     assert {row["state"] for row in after["job"]} == {"done"}  # what was to select from the forgotten scores is gone
     known = [row["model_error"] for row in after["round"] if row["model_error"]]
@@ -116,6 +117,52 @@ def test_going_back_to_the_third_schema_leaves_nothing_that_its_service_does_not
     assert set(known[0]) == OLD_ERROR
     assert all(set(each) == OLD_ERROR - {"by_group"} for each in known[0]["by_group"].values())
     assert known[0]["by_group"]["movement"]["loss"] == 0.5
+    assert {row["status"] for row in after["round"]} == {"current"}  # their networks are old ones
+    older = {"strategy": "cycle", "requested_strategy": "cycle", "items": [{"rank": 0}]}
+    assert [json.loads(row["body"]) for row in after["idempotency"]] == [older]
+    check_references(url)
+    migrate(url)
+    assert differences(url) == []
+
+
+def test_going_back_ends_rounds_whose_networks_an_older_service_cannot_read(url: str) -> None:
+    """One is current, the other has just trained its networks and waits for its scores."""
+    migrate(url, "0001")
+    before = fill(url)
+    migrate(url)
+    trained, waiting = (quoted(url, UUID(int=project.int + 3)) for project in (FIRST, SECOND))
+    kept = "project_id, round_id, 1, family, config, sha256, bytes, watermark, metrics, created_at"
+    columns = "project_id, round_id, member, family, config, sha256, bytes, watermark, metrics, created_at"
+    copies = {
+        "inverse_dynamics": kept.replace("config", """'{"hidden": 256, "dropout": 0.2}'"""),
+        "subgoal_generator": kept,
+    }
+    names = {
+        (kind, owner): quoted(url, UUID(int=20_000 + number))
+        for number, (kind, owner) in enumerate((kind, owner) for kind in copies for owner in (trained, waiting))
+    }
+    write(
+        url,
+        *(
+            f"INSERT INTO model_version (id, kind, {columns}) SELECT '{name}', '{kind}', {copies[kind]} "  # noqa: S608
+            f"FROM model_version WHERE round_id = '{owner}' AND kind = 'world_model'"
+            for (kind, owner), name in names.items()
+        ),
+        f"UPDATE round SET status = 'scoring' WHERE id = '{waiting}'",  # noqa: S608
+    )
+    downgrade(url, "0003")
+    after = read(url)
+    assert {row["id"]: row["status"] for row in after["round"]} == {
+        UUID(int=FIRST.int + 3).hex: "superseded",
+        UUID(int=SECOND.int + 3).hex: "failed",
+    }
+    assert [row["error"] is None for row in sorted(after["round"], key=lambda row: row["id"])] == [True, False]
+    assert (after["scoring"], after["queue"], after["shard"]) == ([], [], [])
+    assert {row["labels_at_round"] for row in after["project"] if row["id"] != EMPTY.hex} == {0}
+    assert {row["labels_at_round"] for row in after["project"] if row["id"] == EMPTY.hex} == {1}
+    assert {row["kind"] for row in after["model_version"]} == {"world_model", "inverse_dynamics"}
+    assert {row["state"] for row in after["job"]} == {"done"}
+    assert after["label"] == narrowed(read(url), before)["label"] == before["label"]
     check_references(url)
     migrate(url)
     assert differences(url) == []

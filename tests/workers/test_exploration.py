@@ -12,7 +12,7 @@ from api_schemas.acquisitions import Acquisition
 from asim.errors import Conflict, NotReady
 from models import checkpoints
 from models.acquisition import EXPLORING, STRATEGIES
-from models.exploration import distinct, explore
+from models.exploration import distinct, explore, looks
 from models.segments import at
 from models.subgoal_generators.base import SubgoalGenerator
 from service.store.queries import pool as pool_queries
@@ -65,7 +65,7 @@ def test_proposals_have_the_scores_of_the_strategy_on_the_rounds_networks(traine
     subgoals = checkpoints.load(trained.blobs.get("weights", generator.sha256))
     models = replace(models, subgoal_generator=cast(SubgoalGenerator, subgoals))
     batch = data.load(trained.blobs, windows, 1)
-    batch = batch.take(distinct(at(batch.observations, 0)))  # of rooms that look the same, one
+    batch = batch.take(distinct(looks(at(batch.observations, 0))))  # of rooms that look the same, one
     found = explore(EXPLORING["confident_cycle"], models, at(batch.observations, 0), 1, torch.Generator())
     names = [batch.segments[int(row)] for row in found.states]
     direct = {
@@ -186,18 +186,47 @@ def test_after_a_cancelled_job_other_states_are_drawn_than_before(
 
 
 def test_what_was_given_out_is_not_proposed_again_and_in_the_end_there_is_nothing(
-    opened: OpenLoop, trained_folder: Path, monkeypatch: pytest.MonkeyPatch
+    opened: OpenLoop, trained_folder: Path
 ) -> None:
-    monkeypatch.setattr("workers.exploration.STATES", 10**6)
     trained = opened(trained_folder)
-    asked: list[Proposal] = []
+    given: list[Proposal] = []
 
     def ask_for_all() -> None:
         while True:
-            asked.extend(proposals(trained.acquire(450, mode="explore")))
+            given.extend(proposals(trained.acquire(450, mode="explore")))
 
     with pytest.raises(Conflict, match=r"all that confident_cycle finds to explore .* has been given out"):
         ask_for_all()
-    rooms = {proposal[:2] for proposal in asked}
-    assert len(asked) == len(set(asked)) == len(rooms) * 7
+    rooms = {proposal[:2] for proposal in given}
+    assert len(given) == len(set(given)) == len(rooms) * 7
     assert len(trained.jobs("propose_explorations")) == 7 + 1
+
+
+def test_nor_is_it_from_another_state_that_looks_the_same(
+    opened: OpenLoop, trained_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.exploration.STATES", 400)  # of 600: others of a room are drawn the second time
+    trained = opened(trained_folder)
+    given = [item for _ in range(4) for item in trained.acquire(150, mode="explore").items]
+    assert len(trained.jobs("propose_explorations")) == 2
+    content = {
+        name: trained.client.trajectory_content(trained.project.id, name)
+        for name in {each.trajectory for each in given}
+    }
+    seen = [
+        (*(content[each.trajectory][name][each.start].tobytes() for name in ("grid", "carried")), str(each.actions))
+        for each in given
+    ]
+    assert len(set(seen)) == len(seen)
+
+
+def test_what_one_strategy_gave_out_another_does_not(opened: OpenLoop, trained_folder: Path) -> None:
+    """Both propose the same: in explore mode `confident_cycle` is `cycle`."""
+    trained = opened(trained_folder)
+    for strategy in ("confident_cycle", "cycle"):
+        with pytest.raises(NotReady):
+            trained.client.acquire(trained.project.id, 1, strategy=strategy, mode="explore", wait=0)
+    trained.drain()
+    first, second = (trained.acquire(100, strategy, mode="explore") for strategy in ("confident_cycle", "cycle"))
+    assert (first.strategy, second.strategy) == ("confident_cycle", "cycle")
+    assert len({*proposals(first), *proposals(second)}) == 200

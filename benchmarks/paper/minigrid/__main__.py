@@ -94,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
 
 
 def _arms() -> list[str]:
-    """Every strategy and explore mode under top-n and the default rule. What draws at random has no rule."""
+    """Every strategy under top-n and the default rule, explore mode under the latter. What draws by chance has none."""
     from benchmarks.paper.minigrid.arms import CHANCE, EXPLORE
     from models.acquisition import STRATEGIES
 

@@ -98,6 +98,7 @@ def figures(arms: Results, default: Arm) -> list[Figure]:
         Figure(
             "4d_labels_used", estimate([1.0 if share is None else share for share in used]).mean, "share", 0.4, "below"
         ),
+        Figure("4d_seeds_that_reach_random", sum(share is not None for share in used) / len(used), "share", 1.0),
         Figure("4d_loss_of_random", ratio(ours, random, LOSS), "ratio", 0.4, "below"),
         Figure("4d_loss_of_oracle_top", ratio(ours, oracle, LOSS), "ratio", 0.65, "below"),
         Figure("4d_p_random", paired(ours, random, LOSS), "p", 0.05, "below"),

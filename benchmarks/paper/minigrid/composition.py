@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.paper.minigrid.datasets import check_seed, grid_spaces, kept
+from benchmarks.paper.minigrid.datasets import check_seed, data_digest, grid_spaces, kept
 from models.segments import SegmentBatch
 from workers.episodes import Episode, new_episodes
 from workers.simulators.base import Simulator
@@ -124,7 +124,7 @@ def training_set(seed: int, labels: int, draw: Draw, folder: Path) -> SegmentBat
     likely as any other, also those that change nothing, whose label is the set of all actions that explain them.
     """
     check_seed(seed)
-    path = folder / f"composition-{draw}-{labels}-{seed}.npz"
+    path = folder / f"composition-{draw}-{labels}-{seed}-{data_digest()}.npz"
     return kept(path, lambda: _batch(_uniform(seed, labels) if draw == "uniform" else _seen(seed, labels)))
 
 
@@ -136,7 +136,7 @@ def _seen(seed: int, labels: int) -> list[Transition]:
 def test_set(seed: int, per_action: int, folder: Path) -> SegmentBatch:
     """Effective transitions, as many of each action: interactions that are held out, and movement, which is neutral."""
     check_seed(seed)
-    path = folder / f"composition-test-{per_action}-{seed}.npz"
+    path = folder / f"composition-test-{per_action}-{seed}-{data_digest()}.npz"
     return kept(path, lambda: _batch(_held_out(seed, per_action)))
 
 

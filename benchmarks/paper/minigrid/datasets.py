@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.paper.runs import write_at_once
+from benchmarks.paper.runs import DATA, sources_digest, write_at_once
 from models.segments import Segment, SegmentBatch
 from models.spaces import DiscreteAction, Spaces, StreamSpec
 from service.store import codec
@@ -64,7 +64,8 @@ class DataSpec:
 
     def file(self, folder: Path) -> Path:
         """Where the set is kept."""
-        digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+        told = asdict(self) | {"code": data_digest()}
+        digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
         return folder / f"{self.behavior}-{digest}.npz"
 
 
@@ -72,6 +73,11 @@ def grid_spaces(size: int) -> Spaces:
     """Spaces of an object room, whose size counts the walls."""
     streams = {"grid": StreamSpec((size, size, 3), "uint8"), "carried": StreamSpec((3,), "uint8")}
     return Spaces(streams, DiscreteAction(ACTIONS))
+
+
+def data_digest() -> str:
+    """Of the code that makes sets: files of sets are named by it, so none of other code is taken for one of this."""
+    return sources_digest(*DATA)
 
 
 def check_seed(seed: int) -> None:

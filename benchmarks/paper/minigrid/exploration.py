@@ -5,8 +5,9 @@ drawn uniformly, as a project explores before its first round. Both execute from
 worker does; an action that changes nothing is a label like any other and counts.
 """
 
+from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -14,10 +15,10 @@ from torch import Tensor
 
 from benchmarks.paper.minigrid.arms import CHANCE
 from benchmarks.paper.minigrid.datasets import ACTIONS, TUNING, DataSpec
-from benchmarks.paper.minigrid.loop import Experiment
+from benchmarks.paper.minigrid.loop import Experiment, Round
 from models.acquisition import EXPLORING, Models
 from models.chance import scoring_generator
-from models.exploration import STATES, distinct, explore, order
+from models.exploration import STATES, Asked, asked, distinct, explore, looks, order
 from models.segments import Observations, Segment, SegmentBatch, at
 from workers.diagnosis import draw_places
 from workers.explanation import explain
@@ -31,6 +32,12 @@ class Exploration(Experiment):
 
     spec: DataSpec = DataSpec("mixture", 1, TUNING)  # noqa: RUF009  # frozen
     states: tuple[State, ...] = ()
+    before: set[Asked] = field(default_factory=set)
+
+    def rounds(self) -> Iterator[Round]:
+        """Nothing is executed twice where it looks the same."""
+        self.before.clear()
+        yield from super().rounds()
 
     def _scores(self, number: int, models: Models) -> Tensor:
         """The pool itself is not scored."""
@@ -52,12 +59,14 @@ class Exploration(Experiment):
 
     def _proposed(self, models: Models, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         rows = torch.tensor(draw_places(self.pool.size, [], STATES, generator))
-        rows = rows[distinct(at(self.pool.take(rows).observations, 0))]
+        rows = rows[distinct(looks(at(self.pool.take(rows).observations, 0)))]
         now = at(self.pool.take(rows).observations, 0)
-        found = explore(EXPLORING["cycle"], models, now, 1, generator)
+        seen = looks(now)
+        found = explore(EXPLORING["cycle"], models, now, 1, generator).without(seen, self.before)
         queue = order(self.arm.orders, models, now, found, self.plan.queue_length, generator)
-        best = queue[: self.plan.batch_labels]
-        return rows[found.states[best]], found.actions[best]
+        chosen = found.take(queue[: self.plan.batch_labels])
+        self.before.update(map(asked, [seen[state] for state in chosen.states.tolist()], chosen.actions.tolist()))
+        return rows[chosen.states], chosen.actions
 
     def _executed(self, rows: Tensor, actions: Tensor) -> SegmentBatch:
         """The labels (N, 1) with all actions that explain each of them."""

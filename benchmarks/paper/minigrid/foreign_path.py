@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import torch
+
 from benchmarks.figures import Figure, finish
 from benchmarks.paper.minigrid import foreign
 from benchmarks.paper.minigrid.acquisition import BY_ACTION
@@ -19,6 +21,7 @@ from benchmarks.paper.minigrid.datasets import GROUPS
 from benchmarks.paper.minigrid.inverse_accuracy import AccuracyRun, by_action, inferred_right
 from benchmarks.paper.minigrid.loop import Experiment, Plan, errors
 from benchmarks.paper.minigrid.rooms import Rooms
+from benchmarks.paper.runs import add_options
 from models.segments import SegmentBatch
 
 Numbers = dict[str, float | None]
@@ -27,14 +30,18 @@ Numbers = dict[str, float | None]
 def main(argv: Sequence[str] | None = None) -> list[Figure]:
     """Both figures both ways; how far apart the numbers are."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("results/paper/minigrid"))
+    add_options(parser, "foreign")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--labels", type=int, default=203, help="of figure 4a, balanced")
-    parser.add_argument("--tuning", action="store_true", help="rooms that no table reports")
     asked = parser.parse_args(argv)
-    rooms = Rooms(asked.out / "4d" / "data", asked.tuning)
-    run = AccuracyRun("sparse", "balanced", asked.labels, asked.seed, asked.out / "4a" / "data", asked.tuning)
-    return [*accuracy(run, asked.out / "4a" / "as-file.npz"), *errors_of(rooms, asked.seed, asked.out / "4d")]
+    torch.set_num_threads(asked.threads)
+    beside = asked.out.parent  # where figures 4a and 4d keep their sets and networks
+    rooms = Rooms(beside / "4d" / "data", asked.tuning)
+    run = AccuracyRun("sparse", "balanced", asked.labels, asked.seed, beside / "4a" / "data", asked.tuning)
+    return [
+        *accuracy(run, asked.out / "4a.npz"),
+        *errors_of(rooms, asked.seed, rooms.networks(beside / "4d"), asked.out / "4d.npz"),
+    ]
 
 
 def accuracy(run: AccuracyRun, file: Path) -> list[Figure]:
@@ -44,11 +51,11 @@ def accuracy(run: AccuracyRun, file: Path) -> list[Figure]:
     return compared("4a", test, native, replace(run, test_set=file).results()["accuracy"])
 
 
-def errors_of(rooms: Rooms, seed: int, out: Path, plan: Plan | None = None) -> list[Figure]:
-    """Figure 4d: model error after the first round, overall, by group and by action."""
-    data, file = rooms.load(), out / "as-file.npz"
+def errors_of(rooms: Rooms, seed: int, networks: Path, file: Path, plan: Plan | None = None) -> list[Figure]:
+    """Figure 4d: model error after the first round, overall, by group and by action. networks: folder of those kept."""
+    data = rooms.load()
     test = written(data.tests["balanced"], file)
-    experiment = Experiment(Arm("random", "top"), seed, data.spaces, data.pool, rooms.networks(out), plan or Plan())
+    experiment = Experiment(Arm("random", "top"), seed, data.spaces, data.pool, networks, plan or Plan())
     models = next(experiment.rounds()).models
     theirs = replace(rooms, test_set=file).load().tests["balanced"]
     native, foreigners = (errors(models, {"test": each}, GROUPS | BY_ACTION)["test"] for each in (test, theirs))

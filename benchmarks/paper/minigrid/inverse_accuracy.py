@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from math import nan
 from pathlib import Path
 from typing import Any, Literal
 
@@ -153,11 +154,11 @@ def print_table(found: Sequence[Json]) -> None:
 def print_warnings(found: Sequence[Json]) -> None:
     """What a service would say of the sparse form's labels if the test were held out there, and with how many seeds."""
     for (form, draw, labels), group in grouped(found).items():
-        sentences = [sentence for each in group for sentence in each["warnings"]] if form == TARGETED else []
-        for action in ACTION_NAMES:
-            about = [sentence for sentence in sentences if f"too little of {action}:" in sentence]
-            if about:
-                print(f"{draw}, {labels} labels, {len(about)} of {len(group)} seeds: {about[0]}")
+        said = dict[str, list[str]]()  # by what comes before the colon: figures differ by seed
+        for sentence in [each for result in group for each in result["warnings"]] if form == TARGETED else []:
+            said.setdefault(sentence.partition(":")[0], []).append(sentence)
+        for sentences in said.values():
+            print(f"{draw}, {labels} labels, {len(sentences)} of {len(group)} seeds: {sentences[0]}")
 
 
 def grouped(found: Sequence[Json]) -> dict[tuple[str, str, int], list[Json]]:
@@ -172,7 +173,7 @@ def draw_chart(found: Sequence[Json], path: Path) -> None:
     """Bars by action for each form, from the most balanced labels."""
     most = max(each["labels"] for each in found)
     bars = {
-        form: [estimate(_known([each["accuracy"][action] for each in group]) or [0.0]) for action in ACTION_NAMES]
+        form: [estimate(_known([each["accuracy"][action] for each in group]) or [nan]) for action in ACTION_NAMES]
         for (form, draw, labels), group in grouped(found).items()
         if draw == found[0]["draw"] and labels == most
     }

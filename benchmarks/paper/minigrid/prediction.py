@@ -30,6 +30,7 @@ from models.network import Network
 from models.segments import SegmentBatch
 from models.training import train
 
+FILE = "file"  # names the test that is a file's
 FORMS = {"sparse": "inverse_dynamics", "dense": "dense_inverse_dynamics"}
 Name = Literal["4b", "4c", "noise"]
 
@@ -80,7 +81,7 @@ class PredictionRun:
         told: Json = {"draw": self.draw, "labels": self.labels, "seed": self.seed, "trained": self.trained.name}
         if self.test_set is not None:
             file = foreign.read(self.test_set)
-            return told | {"tests": {self.test_set.stem: without_simulator(world_model, inverses, file)}}
+            return told | {"tests": {FILE: without_simulator(world_model, inverses, file)}}
         tests = {room: room.test(self.per_action, self._first(), self.folder) for room in self.tested}
         return told | {
             "tests": {room.name: with_simulator(world_model, inverses, room, *test) for room, test in tests.items()}
@@ -132,7 +133,7 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     run_missing(runs, asked.out, asked.processes, asked.threads)
     found = results(runs, asked.out)
     if asked.test_set is not None:
-        print_file_table(found, asked.test_set.stem)
+        print_file_table(found, FILE)
         return []
     print_tables(asked.figures, found)
     draw_charts(asked.figures, found, asked.out)

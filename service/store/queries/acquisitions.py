@@ -77,7 +77,7 @@ def times_proposed(session: Session, scoring: ScoringRow) -> int:
     return session.scalar(alike.with_only_columns(func.sum(ScoringRow.selections))) or 0
 
 
-def explored(session: Session, project_id: UUID, round_id: UUID | None) -> set[tuple[str, int, tuple[object, ...]]]:
+def explored(session: Session, project_id: UUID, round_id: UUID | None) -> list[tuple[str, int, list[object]]]:
     """Trajectory, observation and actions of explorations that were given out under the round, or answered in any."""
     columns = (AcquisitionItemRow.trajectory_id, AcquisitionItemRow.start, AcquisitionItemRow.actions)
     statement = select(*columns).join(AcquisitionRow, AcquisitionRow.id == AcquisitionItemRow.acquisition_id)
@@ -86,7 +86,7 @@ def explored(session: Session, project_id: UUID, round_id: UUID | None) -> set[t
         AcquisitionRow.mode == "explore",
         or_(AcquisitionItemRow.answer.is_not(None), AcquisitionRow.round_id == round_id),
     )
-    return {(trajectory, start, tuple(actions or ())) for trajectory, start, actions in session.execute(statement)}
+    return [(trajectory, start, list(actions or ())) for trajectory, start, actions in session.execute(statement)]
 
 
 class Queued(NamedTuple):
@@ -132,13 +132,6 @@ def explorations(session: Session, scoring: ScoringRow, count: int) -> Sequence[
     """The best `count` of what a scoring proposes to execute. Each is given out once: who takes them drops them."""
     statement = select(QueueRow).where(QueueRow.scoring_id == scoring.id).order_by(QueueRow.rank).limit(count)
     return session.scalars(statement).all()
-
-
-def drop_explorations(session: Session, scoring: ScoringRow, ranks: Sequence[int]) -> None:
-    """They are given out: nobody is offered them again."""
-    for i in range(0, len(ranks), 500):
-        where = (QueueRow.scoring_id == scoring.id, QueueRow.rank.in_(ranks[i : i + 500]))
-        session.execute(delete(QueueRow).where(*where).execution_options(synchronize_session=False))
 
 
 def add_items(session: Session, items: Sequence[Mapping[str, object]]) -> None:
@@ -236,6 +229,14 @@ def drop_from_queues(session: Session, project_id: UUID, segments: Sequence[Segm
         rows = select(QueueRow.scoring_id, QueueRow.rank).where(QueueRow.project_id == project_id, named)
         gone = tuple_(QueueRow.scoring_id, QueueRow.rank).in_(rows.with_for_update(skip_locked=True))
         session.execute(delete(QueueRow).where(gone).execution_options(synchronize_session=False))
+
+
+def drop_explorations(session: Session, project_id: UUID, places: Sequence[Segment]) -> None:
+    """What begins where an exploration has just been given out is offered to nobody, by no strategy."""
+    for some in parts(places):
+        named = and_(among(session, QueueRow.trajectory_id, QueueRow.start, some), QueueRow.actions.is_not(None))
+        gone = delete(QueueRow).where(QueueRow.project_id == project_id, named)
+        session.execute(gone.execution_options(synchronize_session=False))
 
 
 def note_leased(session: Session, scoring_id: UUID, ranks: Sequence[int], until: datetime) -> None:

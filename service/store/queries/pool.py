@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import NamedTuple
 from uuid import UUID
 
-from sqlalchemy import ColumnElement, and_, bindparam, exists, func, select
+from sqlalchemy import ColumnElement, and_, bindparam, func, select
 from sqlalchemy.orm import Session
 
 from api_schemas.base import Split
@@ -88,12 +88,6 @@ def members(
     return [Member(name, segments) for name, segments in session.execute(statement.order_by(MembershipRow.id))]
 
 
-def is_any(session: Session, project_id: UUID, split: str, *, with_provenance: bool = False) -> bool:
-    """Whether the split has members that have segments; with_provenance: with simulator states."""
-    there = exists().where(*_members(project_id, split, with_provenance), MembershipRow.segments > 0)
-    return bool(session.scalar(select(there)))
-
-
 def _members(project_id: UUID, split: str, with_provenance: bool) -> list[ColumnElement[bool]]:
     kept = [MembershipRow.provenance_sha256.is_not(None)] if with_provenance else []
     return [MembershipRow.project_id == project_id, MembershipRow.split == split, *kept]
@@ -125,10 +119,16 @@ def memberships_of(session: Session, project_id: UUID, trajectory_ids: Sequence[
     return found
 
 
-def newest_membership(session: Session, project_id: UUID, split: str) -> int:
-    """Id of the youngest member of a split; 0 where it is empty."""
-    statement = select(func.max(MembershipRow.id)).where(
-        MembershipRow.project_id == project_id, MembershipRow.split == split
+def newest_membership(session: Session, project_id: UUID, split: str, *, with_provenance: bool = False) -> int:
+    """Id of the youngest member of a split, or of those with simulator states; 0 where there is none."""
+    statement = select(MembershipRow.id).where(*_members(project_id, split, with_provenance))
+    return session.scalar(statement.order_by(MembershipRow.id.desc()).limit(1)) or 0
+
+
+def count_members(session: Session, project_id: UUID, split: str, last: int) -> int:
+    """How many members a split had when this membership was the youngest."""
+    statement = select(func.count()).where(
+        *_members(project_id, split, with_provenance=False), MembershipRow.id <= last
     )
     return session.scalar(statement) or 0
 
