@@ -70,7 +70,7 @@ def states(session: Session, project: ProjectRow, last: int | None = None) -> St
 
 def newest_explorable(session: Session, project: ProjectRow) -> int:
     """The youngest membership that holds such states; 0 where none does. It looks from the youngest back."""
-    return queries.newest_membership(session, project.id, "pool", with_provenance=_simulated(project))
+    return queries.newest_with_segments(session, project.id, "pool", with_provenance=_simulated(project))
 
 
 def explorations(project: ProjectRow, states: States, count: int) -> list[Candidate]:

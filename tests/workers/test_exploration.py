@@ -16,7 +16,7 @@ from models.exploration import distinct, explore, looks
 from models.segments import at
 from models.subgoal_generators.base import SubgoalGenerator
 from service.store.queries import pool as pool_queries
-from service.store.tables import ProjectRow, QueueRow, ScoringRow
+from service.store.tables import MembershipRow, ProjectRow, QueueRow, ScoringRow
 from tests.workers.conftest import OpenLoop
 from tests.workers.in_process import Loop
 from workers import data, scoring
@@ -230,3 +230,11 @@ def test_what_one_strategy_gave_out_another_does_not(opened: OpenLoop, trained_f
     first, second = (trained.acquire(100, strategy, mode="explore") for strategy in ("confident_cycle", "cycle"))
     assert (first.strategy, second.strategy) == ("confident_cycle", "cycle")
     assert len({*proposals(first), *proposals(second)}) == 200
+
+
+def test_a_pool_of_trajectories_too_short_for_a_segment_is_not_explored(trained: Loop) -> None:
+    with trained.worker.database.write() as session:
+        session.query(MembershipRow).update({"segments": 0})
+    with pytest.raises(Conflict, match="no trajectory whose states in minigrid are kept"):
+        trained.client.acquire(trained.project.id, 1, mode="explore", wait=0)
+    assert not trained.jobs("propose_explorations")

@@ -119,9 +119,17 @@ def memberships_of(session: Session, project_id: UUID, trajectory_ids: Sequence[
     return found
 
 
-def newest_membership(session: Session, project_id: UUID, split: str, *, with_provenance: bool = False) -> int:
-    """Id of the youngest member of a split, or of those with simulator states; 0 where there is none."""
-    statement = select(MembershipRow.id).where(*_members(project_id, split, with_provenance))
+def newest_membership(session: Session, project_id: UUID, split: str) -> int:
+    """Id of the youngest member of a split; 0 where it is empty."""
+    statement = select(func.max(MembershipRow.id)).where(*_members(project_id, split, with_provenance=False))
+    return session.scalar(statement) or 0
+
+
+def newest_with_segments(session: Session, project_id: UUID, split: str, *, with_provenance: bool) -> int:
+    """Id of the youngest member of a split from which segments are cut; with_provenance: and with simulator states."""
+    statement = select(MembershipRow.id).where(
+        *_members(project_id, split, with_provenance), MembershipRow.segments > 0
+    )
     return session.scalar(statement.order_by(MembershipRow.id.desc()).limit(1)) or 0
 
 
