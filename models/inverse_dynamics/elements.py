@@ -25,7 +25,7 @@ class ElementPairs(nn.Module):
         super().__init__()
         self.dropout = dropout
         self.mlp = Mlp((elements * PAIR_WORDS, hidden, hidden, outputs))
-        values = torch.arange(CHANNELS).repeat_interleave(torch.tensor(cells.VOCABULARY))
+        values = cells.channel_of_word()
         same = torch.full((CHANNELS,), CHANNELS)  # never hidden
         self.register_buffer("channel_of_word", torch.cat((values, values, same)), persistent=False)
 
@@ -47,7 +47,7 @@ class ElementPairs(nn.Module):
 def element_words(before: Tensor, after: Tensor) -> Tensor:
     """Elements uint8 (N, E, 3) at t and t+1 -> float (N, E, 47)."""
     same = before == after
-    return torch.cat((one_hot(before), one_hot(after), same), 2).float()
+    return torch.cat((cells.one_hot(before), cells.one_hot(after), same), 2).float()
 
 
 def touched_elements(before: Observations, after: Observations) -> tuple[Tensor, Tensor]:
@@ -58,13 +58,6 @@ def touched_elements(before: Observations, after: Observations) -> tuple[Tensor,
         for frame in (before, after)
     ]
     return both[0], both[1]
-
-
-def one_hot(elements: Tensor) -> Tensor:
-    """Each channel one-hot: uint8 (N, E, 3) -> uint8 (N, E, 22)."""
-    offsets = torch.tensor((0, cells.OBJECTS, cells.OBJECTS + cells.COLOURS), device=elements.device)
-    codes = torch.zeros(*elements.shape[:2], cells.WORDS, dtype=torch.uint8, device=elements.device)
-    return codes.scatter_(2, elements.long() + offsets, 1)
 
 
 def pairs(observations: Observations) -> tuple[Observations, Observations]:

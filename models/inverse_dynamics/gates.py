@@ -14,7 +14,6 @@ from models.inverse_dynamics.elements import (
     ElementPairs,
     action_count,
     element_words,
-    one_hot,
     pairs,
     steps,
 )
@@ -111,8 +110,8 @@ class GridCellMaskedInverseDynamics(GridInverseDynamics):
         weight, place = weights.max(1)
         blocks = []
         for frame in (before, after):
-            seen = one_hot(cells.gather_cells(frame["grid"].flatten(1, 2), place)) * (weight > 0).unsqueeze(2)
-            blocks += [seen, one_hot(frame["carried"].unsqueeze(1))]
+            seen = cells.one_hot(cells.gather_cells(frame["grid"].flatten(1, 2), place)) * (weight > 0).unsqueeze(2)
+            blocks += [seen, cells.one_hot(frame["carried"].unsqueeze(1))]
         return torch.cat(blocks, 1).flatten(1)
 
     @torch.no_grad()
@@ -120,7 +119,9 @@ class GridCellMaskedInverseDynamics(GridInverseDynamics):
         """All cells of both frames, one-hot but for the open ones, which are zero: uint8 (B*L, 2*S*S*22)."""
         before, after = pairs(observations)
         closed = ~self.open_cells(before["grid"]).unsqueeze(2)
-        return torch.cat([one_hot(frame["grid"].flatten(1, 2)) * closed for frame in (before, after)], 1).flatten(1)
+        return torch.cat([cells.one_hot(frame["grid"].flatten(1, 2)) * closed for frame in (before, after)], 1).flatten(
+            1
+        )
 
     def _look(self, grid: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of the gates (N, S*S), attention (N, S*S, K)."""

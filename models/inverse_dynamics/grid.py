@@ -10,7 +10,6 @@ from models.inverse_dynamics.elements import (
     ElementPairs,
     action_count,
     element_words,
-    one_hot,
     pairs,
     steps,
     touched_elements,
@@ -68,7 +67,7 @@ class GridSparseInverseDynamics(GridInverseDynamics):
 
     def verifying_block(self, observations: Observations) -> Tensor:
         """z_S: the channels of the six elements, each one-hot: uint8 (B*L, 6*22)."""
-        return torch.cat([one_hot(elements) for elements in touched_elements(*pairs(observations))], 1).flatten(1)
+        return torch.cat([cells.one_hot(elements) for elements in touched_elements(*pairs(observations))], 1).flatten(1)
 
     def rest(self, observations: Observations) -> Tensor:
         """All cells of both frames, one-hot but for the touched ones, which are zero: uint8 (B*L, 2*S*S*22).
@@ -77,7 +76,7 @@ class GridSparseInverseDynamics(GridInverseDynamics):
         """
         before, after = pairs(observations)
         touched = cells.touched_cells(before["grid"]).unsqueeze(2).expand(-1, -1, cells.WORDS)
-        frames = [one_hot(frame["grid"].flatten(1, 2)).scatter_(1, touched, 0) for frame in (before, after)]
+        frames = [cells.one_hot(frame["grid"].flatten(1, 2)).scatter_(1, touched, 0) for frame in (before, after)]
         return torch.cat(frames, 1).flatten(1)
 
     def _log_prob(self, observations: Observations, generator: torch.Generator | None = None) -> Tensor:
@@ -115,7 +114,7 @@ class GridDenseInverseDynamics(GridInverseDynamics):
     def verifying_block(self, observations: Observations) -> Tensor:
         """It reads everything: all cells and the hand of both frames, one-hot: uint8 (B*L, 2*(S*S+1)*22)."""
         frames = [
-            one_hot(torch.cat((frame["grid"].flatten(1, 2), frame["carried"].unsqueeze(1)), 1))
+            cells.one_hot(torch.cat((frame["grid"].flatten(1, 2), frame["carried"].unsqueeze(1)), 1))
             for frame in pairs(observations)
         ]
         return torch.cat(frames, 1).flatten(1)

@@ -55,10 +55,20 @@ def word(elements: Tensor) -> Tensor:
     return (channels[..., 0] * COLOURS + channels[..., 1]) * STATES + channels[..., 2]
 
 
+def channel_of_word() -> Tensor:
+    """Which channel each of the 22 words is a value of: int64 (22,)."""
+    return torch.arange(len(VOCABULARY)).repeat_interleave(torch.tensor(VOCABULARY))
+
+
 def word_targets(elements: Tensor) -> Tensor:
-    """Rows of the three true channels among the 22 logits: uint8 (N, 3) -> int64 (3, N)."""
-    offsets = torch.tensor((0, OBJECTS, OBJECTS + COLOURS), device=elements.device).unsqueeze(1)
-    return elements.t().long() + offsets
+    """Places of an element's three channels among the 22 words: uint8 (..., 3) -> int64 (..., 3)."""
+    return elements.long() + torch.tensor((0, OBJECTS, OBJECTS + COLOURS), device=elements.device)
+
+
+def one_hot(elements: Tensor) -> Tensor:
+    """Each channel one-hot: uint8 (..., 3) -> uint8 (..., 22)."""
+    codes = torch.zeros(*elements.shape[:-1], WORDS, dtype=torch.uint8, device=elements.device)
+    return codes.scatter_(-1, word_targets(elements), 1)
 
 
 def split_heads(logits: Tensor) -> tuple[Tensor, ...]:
@@ -73,7 +83,7 @@ def cross_entropy(logits: Tensor, elements: Tensor) -> Tensor:
     The vocabulary leads so that each log-sum-exp runs along rows that lie contiguous in memory.
     """
     heads = [torch.logsumexp(head, 0) for head in split_heads(logits)]
-    return heads[0] + heads[1] + heads[2] - logits.gather(0, word_targets(elements)).sum(0)
+    return heads[0] + heads[1] + heads[2] - logits.gather(0, word_targets(elements).t()).sum(0)
 
 
 def probabilities(logits: Tensor) -> list[Tensor]:

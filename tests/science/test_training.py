@@ -58,7 +58,7 @@ def test_interrupted_training_equals_uninterrupted_training(
 def test_a_non_finite_loss_names_step_and_segments(training_set: SegmentBatch) -> None:
     model = GRID.build_world_model(toy_grid.SPACES, None, torch.Generator().manual_seed(0))
     with torch.no_grad():
-        model.decoder.cells.bias[0] = torch.nan
+        model.attention.bias[0] = torch.nan
     with pytest.raises(NonFiniteError, match=r"loss of world_model is nan at step 0; its segments: toy-0:\d"):
         train(model, training_set.take(torch.arange(3)), CONFIG, torch.Generator())
 

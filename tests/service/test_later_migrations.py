@@ -3,6 +3,7 @@
 import json
 from uuid import UUID
 
+import pytest
 from sqlalchemy import select
 
 from service.store.database import migrate, open_database
@@ -174,3 +175,32 @@ def _set_policies(url: str, changed: dict[str, str]) -> None:
         for row in session.scalars(select(ProjectRow)):
             row.policy = row.policy | changed
     database.close()
+
+
+@pytest.mark.parametrize("forth", [True, False])
+def test_rounds_of_the_other_kind_of_world_model_end(url: str, forth: bool) -> None:
+    """One is current, the other trains; what they ranked is gone, and their labels are due for another round."""
+    migrate(url, "0001")
+    before = fill(url)
+    migrate(url, "0007" if forth else "0008")
+    config = '{"channels": 32, "reconstruction": 0.1}' if forth else '{"channels": 32, "floor": 0.0003}'
+    unfinished = quoted(url, UUID(int=SECOND.int + 3))
+    write(
+        url,
+        f"UPDATE model_version SET config = '{config}' WHERE kind = 'world_model'",  # noqa: S608
+        f"UPDATE round SET status = 'scoring' WHERE id = '{unfinished}'",  # noqa: S608
+    )
+    if forth:
+        migrate(url)
+    else:
+        downgrade(url, "0007")
+    after = read(url)
+    assert sorted(row["status"] for row in after["round"]) == ["failed", "superseded"]
+    (error,) = [row["error"] for row in after["round"] if row["error"]]
+    assert error.startswith(f"ended by {'an upgrade' if forth else 'a downgrade'} of the service")
+    assert (after["scoring"], after["queue"], after["shard"]) == ([], [], [])
+    assert {row["labels_at_round"] for row in after["project"] if row["id"] != EMPTY.hex} == {0}
+    assert after["label"] == narrowed(read(url), before)["label"] == before["label"]
+    check_references(url)
+    migrate(url)
+    assert differences(url) == []

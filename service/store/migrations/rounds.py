@@ -1,0 +1,56 @@
+"""Ending rounds whose networks another version of the service cannot read: their labels are due for another round."""
+
+from collections.abc import Callable
+from typing import Any
+
+import sqlalchemy as sa
+from alembic import op
+
+PROJECT = sa.table("project", sa.column("id", sa.Uuid()), sa.column("labels_at_round", sa.Integer()))
+ROUND = sa.table(
+    "round", sa.column("id", sa.Uuid()), sa.column("project_id", sa.Uuid()), sa.column("status"), sa.column("error")
+)
+MODEL = sa.table("model_version", sa.column("round_id", sa.Uuid()), sa.column("kind"), sa.column("config", sa.JSON()))
+SCORING = sa.table(
+    "scoring", sa.column("id", sa.Uuid()), sa.column("round_id", sa.Uuid()), sa.column("strategy", sa.String())
+)
+PARTS = [sa.table(name, sa.column("scoring_id", sa.Uuid())) for name in ("queue", "shard")]
+JOB = sa.table("job", sa.column("id", sa.Uuid()), sa.column("state"), sa.column("subject_id", sa.Uuid()))
+ENDED = "ended by {} of the service, which cannot read its networks: start another round"
+AT_ONCE = 500  # ids in a statement
+
+
+def end_rounds(kind: str, unreadable: Callable[[dict[str, Any]], bool], by: str) -> None:
+    """Those with a network of the kind and a config that is unreadable. by: "an upgrade", "a downgrade".
+
+    Weights stay in the blob store.
+    """
+    models = execute(sa.select(MODEL.c.round_id, MODEL.c.config).where(MODEL.c.kind == kind)).all()
+    unread = [round_id for round_id, config in models if round_id is not None and unreadable(config)]
+    for start in range(0, len(unread), AT_ONCE):
+        _end(unread[start : start + AT_ONCE], ENDED.format(by))
+
+
+def _end(rounds: list[Any], error: str) -> None:
+    current = sa.and_(ROUND.c.id.in_(rounds), ROUND.c.status == "current")
+    unfinished = sa.and_(ROUND.c.id.in_(rounds), ROUND.c.status.in_(("queued", "training", "scoring")))
+    due = sa.select(ROUND.c.project_id).where(sa.or_(current, unfinished))
+    execute(sa.update(PROJECT).where(PROJECT.c.id.in_(due)).values(labels_at_round=0))
+    execute(sa.update(ROUND).where(unfinished).values(status="failed", error=error))
+    execute(sa.update(ROUND).where(current).values(status="superseded"))
+    execute(sa.delete(JOB).where(JOB.c.subject_id.in_(rounds), JOB.c.state.in_(("queued", "running"))))
+    forget_scorings(SCORING.c.round_id.in_(rounds))
+
+
+def forget_scorings(where: sa.ColumnElement[bool]) -> None:
+    """With their queues, and with the jobs that are to do or have done something for them."""
+    gone = sa.select(SCORING.c.id).where(where)
+    execute(sa.delete(JOB).where(JOB.c.subject_id.in_(gone)))
+    for table in PARTS:
+        execute(sa.delete(table).where(table.c.scoring_id.in_(gone)))
+    execute(sa.delete(SCORING).where(where))
+
+
+def execute(statement: sa.Executable) -> Any:
+    """The rows found, if any; whoever asks knows their columns."""
+    return op.get_bind().execute(statement)
