@@ -169,8 +169,3 @@ def take(observations: Observations, rows: Tensor) -> Observations:
 def future(observations: Observations) -> Observations:
     """All observations but the first: (B, L+1, ...) -> (B, L, ...)."""
     return {name: stream[:, 1:] for name, stream in observations.items()}
-
-
-def flatten_steps(observations: Observations) -> Observations:
-    """(B, L, ...) -> (B*L, ...)."""
-    return {name: stream.flatten(0, 1) for name, stream in observations.items()}

@@ -37,10 +37,10 @@ class GridSubgoalGeneratorConfig:
 class GridSubgoalGenerator(nn.Module):
     """p(x'|x) = sum_k p(k|x) p(x'|x, k), trained by hard expectation maximisation.
 
-    The decoder is the world model's architecture with the latent code k where the action would be. The code of a pair
-    is the one that explains it best, found by trying all of them. An amortised posterior trained by straight-through
-    Gumbel softmax collapsed onto one code: an outcome is worth as much in the decoder's entropy as in the code, and
-    then the decoder's mode is always the likeliest outcome.
+    The decoder writes every cell of x' from convolved features, under the latent code k. The code of a pair is the one
+    that explains it best, found by trying all of them. An amortised posterior trained by straight-through Gumbel
+    softmax collapsed onto one code: an outcome is worth as much in the decoder's entropy as in the code, and then the
+    decoder's mode is always the likeliest outcome.
     """
 
     family = "grid"

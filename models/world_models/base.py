@@ -54,7 +54,7 @@ class WorldModel(Network, Protocol):
         ...
 
     def latent_features(self, observations: Observations, actions: Tensor) -> Tensor:
-        """The predicted latent where the action acts: (B, L+1, ...), (B, L, ...) -> (B, D), for diversity."""
+        """Features of what is predicted where the action acts: (B, L+1, ...), (B, L, ...) -> (B, D), for diversity."""
         ...
 
     def signatures(self, observations: Observations, actions: Tensor) -> Tensor:

@@ -29,6 +29,10 @@ class GridWorldModelConfig:
     keep: float = 4.0  # of an element, against copying and writing: added to the logit at the start
     floor: float = 3e-4  # share of a decoded channel that is uniform: no surprise is endless
 
+    def __post_init__(self) -> None:
+        if not 0.0 < self.floor < 1.0:
+            raise ValueError(f"floor must be between 0 and 1, got {self.floor}.")
+
 
 class GridWorldModel(nn.Module):
     """States are soft observations (B, S*S + 1, 22): each channel's distribution, of the cells and then of the hand.
@@ -87,7 +91,7 @@ class GridWorldModel(nn.Module):
     def _features(self, state: Tensor) -> Tensor:
         """(B, S*S + 1, 22) -> (B, S, S, C)."""
         z = self.embedding(state[:, :-1]) + self.carried_embedding(state[:, -1:])
-        h: Tensor = self.convolution(z.view(len(z), self.size, self.size, -1))
+        h: Tensor = self.convolution(z.view(len(z), self.size, self.size, z.shape[2]))
         return h.relu_()
 
     def decode(self, state: Tensor) -> Observations:
@@ -114,8 +118,13 @@ class GridWorldModel(nn.Module):
         return torch.stack(predictions, 1)
 
     def distance(self, prediction: Tensor, reference: Observations) -> Tensor:
-        """Cross-entropy in nats of the decoded prediction, summed over elements and the L steps -> (B,)."""
+        """Cross-entropy in nats of the decoded prediction, summed over elements and the L steps -> (B,).
+
+        A prediction that is right and certain is about 2.5 floor an element away. Raises ValueError for other shapes.
+        """
         targets = cells.word_targets(_elements(reference, 2))  # (B, L, S*S + 1, 3)
+        if prediction.shape[:3] != targets.shape[:3]:
+            raise ValueError(f"predictions {tuple(prediction.shape)} are of other steps than {tuple(targets.shape)}.")
         probability = prediction.gather(3, targets)
         uniform = self.uniform[targets]
         nats: Tensor = -torch.lerp(probability, uniform, self.config.floor).log().sum((1, 2, 3))
@@ -148,7 +157,7 @@ class GridWorldModel(nn.Module):
         touched = cells.touched_cells(observations["grid"][:, :-1].flatten(0, 1))  # (B*L, 2)
         hand = torch.full_like(touched[:, :1], self.size**2)
         read = cells.gather_cells(prediction, torch.cat((touched, hand), 1))
-        return read.view(batch, steps, -1).mean(1)
+        return read.view(batch, steps, 3 * cells.WORDS).mean(1)
 
     def signatures(self, observations: Observations, actions: Tensor) -> Tensor:
         """Per step the action, the cell in front and the hand before, and both after it -> int64 (B, 5 * L)."""

@@ -81,7 +81,8 @@ def _configure_sqlite(connection: DBAPIConnection, _: ConnectionPoolEntry) -> No
     if not isinstance(connection, sqlite3.Connection):
         raise TypeError(f"expected a sqlite3 connection, got {type(connection).__name__}")
     connection.isolation_level = None  # SQLAlchemy's begin event below says BEGIN, not the driver
-    for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "busy_timeout=15000"):
+    # The timeout first: another process may hold the file while this one asks for the journal's mode.
+    for pragma in ("busy_timeout=15000", "journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}")
 
 

@@ -83,8 +83,8 @@ def test_worth_executing_is_what_the_world_model_does_not_know(
     works = ~_same(after, {name: stream[found.states] for name, stream in states.items()})
     loss = true_loss(world_model, found, states, after)
     interaction = found.actions[:, 0] >= 3
-    best = found.scores.argsort(descending=True)[:100]
-    assert float(interaction[best].float().mean()) > 0.8  # movement is all that it has learned; 4 of 7 by chance
+    best = found.scores.argsort(descending=True)[:80]
+    assert float(interaction[best].float().mean()) > 0.9  # movement is all that it has learned; 4 of 7 by chance
     assert float((interaction & works)[best].float().mean()) > 2 * float((interaction & works).float().mean())
     assert float(loss[best].mean()) > 2 * float(loss.mean())
     assert float(found.scores[interaction & works].median()) > 4 * float(found.scores[~interaction].median())

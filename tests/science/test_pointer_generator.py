@@ -1,5 +1,7 @@
 """Heads that keep, copy or write: each by its gate, and what copying is worth where kinds are new."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from torch import Tensor
 
 from models.evaluation import evaluate
 from models.families import GRID
-from models.networks.grid import WORDS, channel_of_word, split_heads
+from models.networks.grid import VOCABULARY, WORDS, channel_of_word, split_heads
 from models.networks.initialisation import initialise, linear
 from models.networks.pointer_generator import LIMIT, PointerGenerator
 from models.segments import SegmentBatch, at
@@ -69,16 +71,29 @@ def test_the_outcome_is_a_distribution_of_each_channel() -> None:
         torch.testing.assert_close(channel.sum(0), torch.ones(1, 5))
 
 
+def test_an_untrained_head_keeps() -> None:
+    """By e^4 against 1 and 1, the share that `keep` gives; what it writes then is uniform."""
+    head, now, source = opened(KEEP), soft(5, 1), soft(1, 2)
+    head.keep = 4.0
+    assert isinstance(head.head, torch.nn.Linear)
+    torch.nn.init.zeros_(head.head.bias)
+    share = math.exp(4.0) / (math.exp(4.0) + 2.0)
+    uniform = 1.0 / torch.tensor(VOCABULARY)[channel_of_word()].view(WORDS, 1, 1)
+    expected = share * now + (1.0 - share) / 2 * (source + uniform)
+    torch.testing.assert_close(head(torch.zeros(1, 5, 4), now, source), expected)
+
+
 def test_nothing_vanishes_into_denormal_floats(movement_only: SegmentBatch) -> None:
     """At which a processor takes several times as long: gates that are shut pass small gradients, not tiny ones."""
     model = GRID.build_world_model(toy_grid.SPACES, None, torch.Generator().manual_seed(0))
     train(model, movement_only, TrainingConfig(200, 32, 1e-2, 1e-2), torch.Generator().manual_seed(0))
     model.zero_grad()
     torch.autograd.backward(model.loss(movement_only.take(slice(0, 32)), torch.Generator().manual_seed(0)))
-    for name, parameter in model.cells.named_parameters():
-        assert parameter.grad is not None
-        sizes = parameter.grad.abs()
-        assert float(sizes[sizes > 0].min()) > 1e-25, name
+    for head in (model.cells, model.carried):
+        for name, parameter in head.named_parameters():
+            assert parameter.grad is not None
+            sizes = parameter.grad.abs()
+            assert float(sizes[sizes > 0].min()) > 1e-30, name
 
 
 def test_a_state_holds_the_whole_observation(world_model: GridWorldModel, held_out: SegmentBatch) -> None:

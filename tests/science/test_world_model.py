@@ -1,5 +1,7 @@
 """The grid world model: what it learns, and its cross-entropy against the definition."""
 
+import math
+
 import pytest
 import torch
 from torch.nn import functional as F
@@ -9,7 +11,7 @@ from models.families import GRID
 from models.networks.grid import cross_entropy
 from models.segments import SegmentBatch, at, first, future
 from models.training import TrainingConfig, train
-from models.world_models.grid import GridWorldModel
+from models.world_models.grid import GridWorldModel, GridWorldModelConfig
 from tests.science import toy_grid
 
 
@@ -50,6 +52,38 @@ def test_distance_counts_every_cell_and_the_carried_object(world_model: GridWorl
         hand = cross_entropy(logits["carried"][:, row : row + 1], after["carried"][row : row + 1]).sum()
         total = world_model.distance(prediction, future(observations))[row]
         torch.testing.assert_close(total, cells + hand)
+
+
+def test_no_surprise_is_endless_and_certainty_costs_next_to_nothing(
+    world_model: GridWorldModel, held_out: SegmentBatch
+) -> None:
+    """A decoded channel is uniform by `floor`: a key for a ball costs as much as that is below certain."""
+    now = first(held_out.take(slice(0, 4)).observations)
+    certain = world_model.encode(at(now, 0)).unsqueeze(1)
+    other = {**now, "carried": now["carried"].clone()}
+    other["carried"][..., 0] = 3  # what nobody carries
+    floor, of = world_model.config.floor, 11
+    surprise = world_model.distance(certain, other) - world_model.distance(certain, now)
+    expected = math.log((1 - floor + floor / of) / (floor / of))
+    torch.testing.assert_close(surprise, torch.full((4,), expected), rtol=1e-3, atol=0)
+    assert float(world_model.distance(certain, now).max()) < 2.6 * floor * 26  # cells and the hand
+
+
+def test_distances_of_several_steps_add_up(world_model: GridWorldModel, held_out: SegmentBatch) -> None:
+    some = held_out.take(slice(0, 3))
+    assert some.actions is not None
+    once = world_model.rollout(world_model.infer_state(first(some.observations)), some.actions)
+    after = future(some.observations)
+    twice = {name: torch.cat((stream, stream), 1) for name, stream in after.items()}
+    both = world_model.distance(torch.cat((once, once), 1), twice)
+    torch.testing.assert_close(both, 2 * world_model.distance(once, after))
+    with pytest.raises(ValueError, match="other steps"):
+        world_model.distance(once, twice)
+
+
+def test_a_floor_of_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="floor must be between 0 and 1, got 0"):
+        GridWorldModelConfig(floor=0.0)
 
 
 def test_a_rollout_is_repeated_prediction(world_model: GridWorldModel, held_out: SegmentBatch) -> None:

@@ -157,12 +157,12 @@ def test_going_back_ends_rounds_whose_networks_an_older_service_cannot_read(url:
         UUID(int=FIRST.int + 3).hex: "superseded",
         UUID(int=SECOND.int + 3).hex: "failed",
     }
-    assert [row["error"] is None for row in sorted(after["round"], key=lambda row: row["id"])] == [True, False]
+    assert all(row["error"].startswith("ended by a downgrade") for row in after["round"])
     assert (after["scoring"], after["queue"], after["shard"]) == ([], [], [])
     assert {row["labels_at_round"] for row in after["project"] if row["id"] != EMPTY.hex} == {0}
     assert {row["labels_at_round"] for row in after["project"] if row["id"] == EMPTY.hex} == {1}
     assert {row["kind"] for row in after["model_version"]} == {"world_model", "inverse_dynamics"}
-    assert {row["state"] for row in after["job"]} == {"done"}
+    assert {row["state"] for row in after["job"]} == {"done", "cancelled"}
     assert after["label"] == narrowed(read(url), before)["label"] == before["label"]
     check_references(url)
     migrate(url)
@@ -196,8 +196,9 @@ def test_rounds_of_the_other_kind_of_world_model_end(url: str, forth: bool) -> N
         downgrade(url, "0007")
     after = read(url)
     assert sorted(row["status"] for row in after["round"]) == ["failed", "superseded"]
-    (error,) = [row["error"] for row in after["round"] if row["error"]]
-    assert error.startswith(f"ended by {'an upgrade' if forth else 'a downgrade'} of the service")
+    ended = f"ended by {'an upgrade' if forth else 'a downgrade'} of the service"
+    assert all(row["error"].startswith(ended) and row["finished_at"] for row in after["round"])
+    assert {row["state"]: row["owner"] for row in after["job"]} == {"done": None, "cancelled": None}
     assert (after["scoring"], after["queue"], after["shard"]) == ([], [], [])
     assert {row["labels_at_round"] for row in after["project"] if row["id"] != EMPTY.hex} == {0}
     assert after["label"] == narrowed(read(url), before)["label"] == before["label"]

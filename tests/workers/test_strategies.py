@@ -1,9 +1,11 @@
 """Every strategy of the catalog runs through the service."""
 
 import pytest
+from sqlalchemy import select
 
 from api_schemas.strategies import CATALOG
 from service.scorings import PREVIOUS
+from service.store.tables import ModelVersionRow
 from tests.workers.in_process import Loop, segments_of
 from workers.training import BASE, ENSEMBLE_MEMBERS
 
@@ -59,3 +61,15 @@ def test_before_the_first_round_every_strategy_falls_back_on_random(labeled: Loo
     for strategy in NETWORKS:
         batch = labeled.acquire(2, strategy)
         assert (batch.strategy, batch.requested_strategy, batch.round) == ("random", strategy, None)
+
+
+def test_what_another_version_of_the_service_trained_is_not_compared_with(trained: Loop) -> None:
+    """A round ended by an upgrade leaves a world model with another config, whose weights nobody can read."""
+    with trained.worker.database.write() as session:
+        row = session.scalars(select(ModelVersionRow).where(ModelVersionRow.kind == "world_model")).one()
+        row.config, row.sha256 = {"channels": 32, "reconstruction": 0.1}, "0" * 64
+    trained.change(strategy="progress")
+    trained.label(4, "random")
+    done = trained.train()
+    assert (done.status, done.error) == ("current", None)
+    assert len(segments_of(trained.acquire(6))) == 6

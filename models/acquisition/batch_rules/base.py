@@ -17,7 +17,7 @@ Description = Literal["features", "signatures"]
 class Candidates:
     """M scored segments, and where they differ, as far as the rule reads it and the strategy has networks to tell.
 
-    scores (M,), finite. features (M, D): the predicted latent where the strategy's action acts. signatures int64
+    scores (M,), finite. features (M, D): of what is predicted where the strategy's action acts. signatures int64
     (M, S): what happens in each, equal for equals. Raises ValueError for lengths that disagree.
     """
 

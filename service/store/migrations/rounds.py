@@ -1,6 +1,10 @@
-"""Ending rounds whose networks another version of the service cannot read: their labels are due for another round."""
+"""Ending rounds whose networks another version of the service cannot read: their labels are due for another round.
+
+As `rounds.fail` and `jobs.cancel` of the service do, but for events, whose form is not the same in all versions.
+"""
 
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Any
 
 import sqlalchemy as sa
@@ -8,14 +12,24 @@ from alembic import op
 
 PROJECT = sa.table("project", sa.column("id", sa.Uuid()), sa.column("labels_at_round", sa.Integer()))
 ROUND = sa.table(
-    "round", sa.column("id", sa.Uuid()), sa.column("project_id", sa.Uuid()), sa.column("status"), sa.column("error")
+    "round",
+    sa.column("id", sa.Uuid()),
+    sa.column("project_id", sa.Uuid()),
+    sa.column("status"),
+    sa.column("error"),
+    sa.column("finished_at", sa.DateTime(timezone=True)),
 )
 MODEL = sa.table("model_version", sa.column("round_id", sa.Uuid()), sa.column("kind"), sa.column("config", sa.JSON()))
 SCORING = sa.table(
     "scoring", sa.column("id", sa.Uuid()), sa.column("round_id", sa.Uuid()), sa.column("strategy", sa.String())
 )
 PARTS = [sa.table(name, sa.column("scoring_id", sa.Uuid())) for name in ("queue", "shard")]
-JOB = sa.table("job", sa.column("id", sa.Uuid()), sa.column("state"), sa.column("subject_id", sa.Uuid()))
+JOB = sa.table(
+    "job",
+    *(sa.column(name) for name in ("state", "owner", "lease_until", "fence")),
+    *(sa.column(name, sa.Uuid()) for name in ("id", "subject_id")),
+    sa.column("finished_at", sa.DateTime(timezone=True)),
+)
 ENDED = "ended by {} of the service, which cannot read its networks: start another round"
 AT_ONCE = 500  # ids in a statement
 
@@ -36,9 +50,12 @@ def _end(rounds: list[Any], error: str) -> None:
     unfinished = sa.and_(ROUND.c.id.in_(rounds), ROUND.c.status.in_(("queued", "training", "scoring")))
     due = sa.select(ROUND.c.project_id).where(sa.or_(current, unfinished))
     execute(sa.update(PROJECT).where(PROJECT.c.id.in_(due)).values(labels_at_round=0))
-    execute(sa.update(ROUND).where(unfinished).values(status="failed", error=error))
-    execute(sa.update(ROUND).where(current).values(status="superseded"))
-    execute(sa.delete(JOB).where(JOB.c.subject_id.in_(rounds), JOB.c.state.in_(("queued", "running"))))
+    now = datetime.now(UTC)
+    execute(sa.update(ROUND).where(unfinished).values(status="failed", error=error, finished_at=now))
+    execute(sa.update(ROUND).where(current).values(status="superseded", error=error))
+    nobodys = {"state": "cancelled", "owner": None, "lease_until": None, "fence": JOB.c.fence + 1, "finished_at": now}
+    alive = (JOB.c.subject_id.in_(rounds), JOB.c.state.in_(("queued", "running")))
+    execute(sa.update(JOB).where(*alive).values(nobodys))
     forget_scorings(SCORING.c.round_id.in_(rounds))
 
 

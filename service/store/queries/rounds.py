@@ -38,14 +38,20 @@ def models_of(session: Session, round_id: UUID) -> Sequence[ModelVersionRow]:
 
 
 def previous_world_model(session: Session, row: RoundRow) -> ModelVersionRow | None:
-    """The world model of the last round before this one that trained one."""
+    """The world model of the last round before this one that trained one.
+
+    None where that was another version of the service: its weights cannot be read, and its config has other fields.
+    """
     statement = (
         select(ModelVersionRow)
         .join(RoundRow, RoundRow.id == ModelVersionRow.round_id)
         .where(RoundRow.project_id == row.project_id, RoundRow.number < row.number)
         .where(ModelVersionRow.kind == "world_model")
     )
-    return session.scalar(statement.order_by(RoundRow.number.desc()).limit(1))
+    previous = session.scalar(statement.order_by(RoundRow.number.desc()).limit(1))
+    own = next((model for model in models_of(session, row.id) if model.kind == "world_model"), None)
+    changed = previous is not None and own is not None and previous.config.keys() != own.config.keys()
+    return None if changed else previous
 
 
 def newest_model(session: Session, project_id: UUID, kind: str) -> ModelVersionRow | None:

@@ -13,7 +13,6 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Rounds that trained the older model end; so none is left with an older inverse dynamics either."""
     end_rounds("world_model", lambda config: "reconstruction" in config, "an upgrade")
 
 
