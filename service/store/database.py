@@ -1,6 +1,7 @@
 """Engines and sessions. SQLite writers begin IMMEDIATE: deferred transactions lose updates or fail under contention."""
 
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 from service.settings import POOL_SIZE
 from service.store.queries.events import keep_order
 
+SQLITE_WAITS = 15_000  # milliseconds
 WAITS = {"lock_timeout": 15_000, "idle_in_transaction_session_timeout": 30_000}  # milliseconds, on PostgreSQL
 
 
@@ -81,9 +83,27 @@ def _configure_sqlite(connection: DBAPIConnection, _: ConnectionPoolEntry) -> No
     if not isinstance(connection, sqlite3.Connection):
         raise TypeError(f"expected a sqlite3 connection, got {type(connection).__name__}")
     connection.isolation_level = None  # SQLAlchemy's begin event below says BEGIN, not the driver
-    # The timeout first: another process may hold the file while this one asks for the journal's mode.
-    for pragma in ("busy_timeout=15000", "journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
+    for pragma in (f"busy_timeout={SQLITE_WAITS}", "synchronous=NORMAL", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}")
+    _write_ahead(connection)
+
+
+def _write_ahead(connection: sqlite3.Connection) -> None:
+    """A new file's first change to the write-ahead log needs it alone, and for that SQLite itself does not wait."""
+    deadline = time.monotonic() + SQLITE_WAITS / 1000
+    while not _has_write_ahead(connection, last_try=time.monotonic() > deadline):
+        time.sleep(0.02)
+
+
+def _has_write_ahead(connection: sqlite3.Connection, last_try: bool) -> bool:
+    """False where another process holds the file. Raises sqlite3.OperationalError for other faults, and at the end."""
+    try:
+        connection.execute("PRAGMA journal_mode=WAL")
+    except sqlite3.OperationalError as error:
+        if last_try or error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+            raise
+        return False
+    return True
 
 
 def _configure_postgresql(connection: DBAPIConnection, _: ConnectionPoolEntry) -> None:

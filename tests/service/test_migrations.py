@@ -1,7 +1,9 @@
 """Migrations: what they build is what the tables say, on both databases; data outlives them, up, down and cut short."""
 
+import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -54,6 +56,24 @@ def _ended(process: subprocess.Popen[bytes]) -> int:
         process.kill()
     assert process.returncode in (0, -9), errors.decode()
     return process.returncode
+
+
+def test_a_new_file_that_another_is_writing_is_waited_for(tmp_path: Path) -> None:
+    """SQLite answers at once that it is locked, whatever its timeout: a log written ahead needs the file alone."""
+    file = tmp_path / "new.sqlite"
+    other = sqlite3.connect(file, isolation_level=None, check_same_thread=False)
+    other.execute("CREATE TABLE begun (id INTEGER)")
+    other.execute("BEGIN IMMEDIATE")
+    end = threading.Timer(0.5, other.execute, ("COMMIT",))
+    end.start()
+    database = open_database(f"sqlite:///{file}")
+    began = time.monotonic()
+    with database.read() as session:
+        assert session.scalar(text("PRAGMA journal_mode")) == "wal"
+    assert time.monotonic() - began > 0.3
+    end.join()
+    database.close()
+    other.close()
 
 
 def test_up_down_and_up_again_is_what_the_tables_say(url: str) -> None:
