@@ -119,9 +119,8 @@ class GridCellMaskedInverseDynamics(GridInverseDynamics):
         """All cells of both frames, one-hot but for the open ones, which are zero: uint8 (B*L, 2*S*S*22)."""
         before, after = pairs(observations)
         closed = ~self.open_cells(before["grid"]).unsqueeze(2)
-        return torch.cat([cells.one_hot(frame["grid"].flatten(1, 2)) * closed for frame in (before, after)], 1).flatten(
-            1
-        )
+        frames = [cells.one_hot(frame["grid"].flatten(1, 2)) * closed for frame in (before, after)]
+        return torch.cat(frames, 1).flatten(1)
 
     def _look(self, grid: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of the gates (N, S*S), attention (N, S*S, K)."""

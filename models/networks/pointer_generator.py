@@ -31,7 +31,7 @@ class PointerGenerator(nn.Module):
     def forward(self, z: Tensor, now: Tensor, source: Tensor) -> Tensor:
         """z (B, N, C), soft elements now (22, B, N) and source (22, B, N or 1) -> soft elements (22, B, N).
 
-        The vocabulary leads, so that every operation runs along rows that lie contiguous in memory.
+        The vocabulary leads, so that a channel is a slice and a gate's weights (B, N) apply to all of its words.
         """
         out = LIMIT * (self.head(z).movedim(-1, 0) / LIMIT).tanh()
         written, gates = out[: cells.WORDS], out[cells.WORDS :]

@@ -69,16 +69,14 @@ class GridWorldModel(nn.Module):
 
     def encode(self, observations: Observations) -> Tensor:
         """grid (B, S, S, 3), carried (B, 3) -> (B, S*S + 1, 22), which holds all of it: nothing is learned."""
-        elements = _elements(observations, 1)
-        codes = torch.zeros(cells.WORDS, *elements.shape[:2], device=elements.device)
-        return codes.scatter_(0, cells.word_targets(elements).movedim(2, 0), 1.0).movedim(0, 2)
+        return cells.one_hot(_elements(observations, 1)).float()
 
     def predict(self, state: Tensor, actions: Tensor) -> Tensor:
         """(B, S*S + 1, 22), int64 (B,) -> (B, S*S + 1, 22).
 
         A cell may copy what the hand held, the hand what it attends to among the cells.
         """
-        words = state.movedim(2, 0)  # the vocabulary leads in memory, too
+        words = state.movedim(2, 0)  # (22, B, S*S + 1)
         grid, carried = words[..., :-1], words[..., -1:]
         film = self.dynamics.parameters_of(self.codebook())  # once an action, not once a row
         z = self.dynamics(self._features(state), film[actions]).flatten(1, 2)  # (B, S*S, C)
