@@ -32,6 +32,8 @@ DATA = (
 """What the simulator's own sets depend on."""
 CODE = (*DATA, "models", "workers/data.py", "workers/diagnosis.py", "workers/training.py", "benchmarks/paper")
 """What results depend on."""
+EXPLORING = ("models/exploration.py", "benchmarks/paper/minigrid/exploration.py")
+"""What only those results depend on that name it under `also`."""
 TELLING = ("_table", "__main__", "charts", "drawing", "foreign_path", "picked_losses", "statistics", "through_service")
 """How the names of modules end that results do not depend on: they tell of them or ask for them."""
 LIBRARIES = ("gymnasium", "minigrid", "numpy", "torch")
@@ -46,7 +48,7 @@ class Run(Protocol):
         ...
 
     def results(self) -> Json:
-        """Do it."""
+        """Do it. Sources of EXPLORING that they depend on are named under `also`."""
         ...
 
 
@@ -70,7 +72,7 @@ def run_missing(runs: Sequence[Run], out: Path, processes: int, threads: int) ->
     context = multiprocessing.get_context("spawn")
     began = time.monotonic()
     with ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(threads,)) as pool:
-        futures = [pool.submit(do, run, out, code_digest()) for run in missing]
+        futures = [pool.submit(do, run, out, code_digest(*EXPLORING)) for run in missing]
         try:
             for done, future in enumerate(as_completed(futures), 1):
                 name, seconds = future.result()
@@ -91,7 +93,7 @@ def read(path: Path) -> Json | None:
     if not path.exists():
         return None
     told: Json = json.loads(path.read_text())
-    return told if told.get("code") == code_digest() else None
+    return told if told.get("code") == code_digest(*told.get("also", ())) else None
 
 
 def result_file(out: Path, run: Run) -> Path:
@@ -100,15 +102,20 @@ def result_file(out: Path, run: Run) -> Path:
 
 
 @cache
-def code_digest() -> str:
-    """Of what results depend on: the sources in CODE, Python and the libraries of LIBRARIES."""
-    return sources_digest(*CODE)
+def code_digest(*also: str) -> str:
+    """Of what results depend on: the sources in CODE and `also`, Python and the libraries of LIBRARIES."""
+    return sources_digest(*CODE, *also)
 
 
 @cache
 def sources_digest(*names: str) -> str:
-    """Of Python files and folders of them below the root, but for modules that only tell; of Python and LIBRARIES."""
-    files = sorted(path for name in names for path in _sources(ROOT / name) if not path.stem.endswith(TELLING))
+    """Of Python files and folders of them below the root, but for modules that only tell; of Python and LIBRARIES.
+
+    Those of EXPLORING count only where they are named themselves.
+    """
+    apart = {ROOT / name for name in EXPLORING if name not in names}
+    found = {path for name in names for path in _sources(ROOT / name) if not path.stem.endswith(TELLING)}
+    files = sorted(found - apart)
     libraries = [f"{name} {version(name)}" for name in LIBRARIES]
     digest = hashlib.sha256(" ".join((sys.version, *libraries)).encode())
     for path in files:
@@ -134,13 +141,14 @@ def write_at_once(path: Path, content: bytes) -> None:
 def do(run: Run, out: Path, code: str | None = None) -> tuple[str, float]:
     """A run in this process, its results kept: its name, and how many seconds it took.
 
-    code: the digest with which the benchmark began. Raises RuntimeError where the code is another by now.
+    code: the digest of all code with which the benchmark began. Raises RuntimeError where it is another by now.
     """
-    if code not in (None, code_digest()):
+    if code not in (None, code_digest(*EXPLORING)):
         raise RuntimeError("The code has changed since the benchmark began; start it again.")
     began = time.monotonic()
     found = run.results()
     seconds = time.monotonic() - began
-    about = {"name": run.name, "code": code_digest(), "seconds": seconds, "threads": torch.get_num_threads()}
+    code = code_digest(*found.get("also", ()))
+    about = {"name": run.name, "code": code, "seconds": seconds, "threads": torch.get_num_threads()}
     write_at_once(result_file(out, run), json.dumps({**about, **found}).encode())
     return run.name, seconds

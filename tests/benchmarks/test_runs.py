@@ -7,7 +7,17 @@ from pathlib import Path
 import pytest
 
 from benchmarks.paper import runs
-from benchmarks.paper.runs import Json, code_digest, do, result_file, results, run_missing, sources_digest
+from benchmarks.paper.runs import (
+    EXPLORING,
+    Json,
+    code_digest,
+    do,
+    read,
+    result_file,
+    results,
+    run_missing,
+    sources_digest,
+)
 
 
 @dataclass(frozen=True)
@@ -73,6 +83,20 @@ def test_the_codes_digest_turns_on_what_results_depend_on(tmp_path: Path, monkey
     assert digests[0] != digests[1] == digests[2] == digests[3] != digests[4]
 
 
+def test_results_depend_on_explore_mode_where_they_say_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else an arm of pool mode would be run again for every change to it."""
+    monkeypatch.setattr(runs, "ROOT", tmp_path)
+    monkeypatch.setattr(runs, "code_digest", lambda *also: sources_digest.__wrapped__(*runs.CODE, *also))
+    source = tmp_path / runs.EXPLORING[0]
+    source.parent.mkdir()
+    source.write_text("x = 0")
+    for number, also in enumerate(((), runs.EXPLORING)):
+        told = {"code": runs.code_digest(*also), "also": also}
+        (tmp_path / f"count{number}.json").write_text(json.dumps(told))
+    source.write_text("x = 1")
+    assert [read(tmp_path / f"count{number}.json") is None for number in (0, 1)] == [False, True]
+
+
 def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path: Path, log: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(ArithmeticError, match="got -2"):
@@ -85,4 +109,4 @@ def test_code_that_changes_under_a_benchmark_ends_it(tmp_path: Path, log: Path) 
     with pytest.raises(RuntimeError, match="The code has changed since the benchmark began"):
         do(Count(1, log), tmp_path, "earlier")
     assert not log.exists()
-    assert do(Count(1, log), tmp_path, code_digest())[0] == "count1"
+    assert do(Count(1, log), tmp_path, code_digest(*EXPLORING))[0] == "count1"

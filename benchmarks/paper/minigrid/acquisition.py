@@ -22,7 +22,7 @@ from benchmarks.paper.minigrid.datasets import GROUPS, load_states
 from benchmarks.paper.minigrid.exploration import Exploration
 from benchmarks.paper.minigrid.loop import Experiment, Round, errors, pool_losses, strategy_scores
 from benchmarks.paper.minigrid.rooms import Data, Rooms, add_files
-from benchmarks.paper.runs import Json, add_options, results, run_missing
+from benchmarks.paper.runs import EXPLORING, Json, add_options, results, run_missing
 from models.rank_correlation import kendall, spearman
 from models.segments import SegmentBatch
 from workers.simulators.minigrid_rules import ACTION_NAMES
@@ -54,7 +54,8 @@ class ArmRun:
         """After every round: model error on each test, rank correlations, what was picked."""
         data = self.rooms.load()
         rounds = [_told(self.arm, found, data) for found in self._experiment(data).rounds()]
-        return {"arm": self.arm.name, "seed": self.seed, "rooms": self.rooms.words, "rounds": rounds}
+        also = EXPLORING if self.arm.strategy in EXPLORERS else ()
+        return {"arm": self.arm.name, "seed": self.seed, "rooms": self.rooms.words, "also": also, "rounds": rounds}
 
     def _experiment(self, data: Data) -> Experiment:
         """In explore mode with the simulator's states, at which nobody but the labeler looks."""
