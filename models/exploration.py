@@ -4,15 +4,17 @@ Algorithm 1 executes along the sampled chain with the largest cycle error. What 
 the generator gets wrong: no action leads there. So no chain is believed by itself. At a state x_t, with futures x~_m of
 prior p_m and predictions x^_a = f(z_t, a) of every action, executing a is worth
 
-    fidelity        -log sum_m w_ma exp(-l(x^_a, x~_m)),   w_ma ~ p_m h(a | x_t, x~_m), summing to 1 over m,
+    0.3 fidelity    -log sum_m w_ma exp(-l(x^_a, x~_m)),   w_ma ~ p_m h(a | x_t, x~_m), summing to 1 over m,
   + cycle error     max_m min_b l(x^_b, x~_m) sqrt(q_ma), over the futures that the generator stands by,
     reachability    q_ma ~ sqrt(h(a | x_t, x~_m)) (1 - h(a | x_t, x^_a)) (1 - p(x^_a)^3) / h(a), summing to 1 over a.
 
 The first is large where what the world model says of a is no plausible outcome of it; one wrong future more only lowers
 it. The second is large where something may happen that the world model expects of no action: one of those led there
 that the inverse dynamics names for it, does not recognise in what the world model expects of them, and of which the
-world model is not sure: p(x^_a) is what it gives to its likeliest prediction. h(a) is how often a is inferred at all.
-Without it an action that few labels show is never inferred, so never executed, so never labeled.
+world model is not sure: p(x^_a) is what it gives to its likeliest prediction. h(a) is how often a is inferred at all,
+and no h is below `UNNAMED`: an action that no label shows is never inferred, so else never executed, so never labeled.
+
+A batch is shared out among the actions: each is given as much of it as its best explorations are worth (`order`).
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +26,7 @@ from torch import Tensor
 
 from models.acquisition.base import CHUNK, Models, NonFiniteScoreError, given, require
 from models.acquisition.batch_rules import BatchRule, Candidates, top
-from models.acquisition.batch_rules.base import description
+from models.acquisition.batch_rules.base import description, weights
 from models.acquisition.cycle import Cycle
 from models.acquisition.reachability import predicted_chain
 from models.inverse_dynamics.base import DiscreteInverseDynamics
@@ -38,8 +40,9 @@ STATES = 4000
 Asked = tuple[bytes, tuple[object, ...]]  # what it looks like there, and the actions
 
 DOUBT = 0.01  # no action is known so well that it leads nowhere else
-RARE = 1e-3  # an action that is inferred less often than this counts as inferred so often
+UNNAMED = 3e-3  # what an action that the inverse dynamics knows nothing of may still explain
 SHARPNESS = 3.0  # a prediction is sure where it leaves out less than about a third of a nat
+FIDELITY = 0.3  # against the cycle error: what is wrong about a step that changes nothing is much alike
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ def explore(
     for start in range(0, len(next(iter(observations.values()))), chunk):
         states = {name: stream[start : start + chunk] for name, stream in observations.items()}
         futures = subgoals.futures(states, horizon, generator)
-        parts.append(_Imagined(states, futures, inverse.log_prob(SegmentBatch(futures.chains))))
+        parts.append(_Imagined(states, futures, _possible(inverse.log_prob(SegmentBatch(futures.chains)))))
         after_each()
     usual = torch.cat([part.log_prob[:, 0].exp() for part in parts]).mean(0)
     actions, scores = list[Tensor](), list[Tensor]()
@@ -131,7 +134,9 @@ def order(
     """Rows of `found` that have the `count` highest scores, so ordered that every prefix is a good batch.
 
     Of each state only the best is among them: several actions there may have no effect, whatever the world model
-    expects, and that is one trajectory and one label. observations: the states (B, ...) that `explore` was given.
+    expects, and that is one trajectory and one label. The rule orders those of each action; how many of an action a
+    prefix holds goes by D'Hondt's highest averages of what they weigh. Else whatever the world model is wrong about
+    most would be all of a batch. observations: the states (B, ...) that `explore` was given.
     """
     best = _best_of_each(found)
     best = best[top(found.scores[best], count)]
@@ -145,7 +150,23 @@ def order(
             chain = SegmentBatch(predicted_chain(world_model, states, found.actions[rows]))
             parts.append(description(rule.reads, world_model, chain, found.actions[rows]))
         candidates = Candidates(found.scores[best], **{rule.reads: torch.cat(parts).cpu()})
-    return best[rule.order(candidates, len(best), generator)]
+    return best[_shared_out(rule, candidates, found.actions[best, 0], generator)]
+
+
+def _shared_out(rule: BatchRule, candidates: Candidates, first: Tensor, generator: torch.Generator) -> Tensor:
+    """All candidates, by place. first int64 (M,): the action that each begins with. The n-th of one counts an n-th."""
+    places, counts = [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0, dtype=torch.float64)]
+    for action in sorted(set(first.tolist())):
+        own = torch.nonzero(first == action).flatten()
+        own = own[rule.order(_some(candidates, own), len(own), generator)]
+        counts.append((weights(candidates.scores[own]) / torch.arange(1, len(own) + 1)).cummin(0).values)
+        places.append(own)
+    return torch.cat(places)[top(torch.cat(counts), candidates.count)]
+
+
+def _some(candidates: Candidates, rows: Tensor) -> Candidates:
+    described = (None if table is None else table[rows] for table in (candidates.features, candidates.signatures))
+    return Candidates(candidates.scores[rows], *described)
 
 
 @dataclass(frozen=True)
@@ -190,9 +211,9 @@ def _scores(
     distance, inferred, rows = torch.stack(distances, 1), torch.stack(named, 1), futures.states  # (M, n)
     weight = futures.log_prob.unsqueeze(1) + inferred
     fidelity = _logsumexp(weight, rows, count) - _logsumexp(weight - distance, rows, count)
-    posterior = (0.5 * inferred + torch.stack(unknown, 1)[rows] - (usual + RARE).log()).softmax(1)
+    posterior = (0.5 * inferred + torch.stack(unknown, 1)[rows] - usual.log()).softmax(1)
     unexplained = torch.where(futures.steady, distance.amin(1), 0.0).unsqueeze(1)
-    return fidelity + _per_state(unexplained * posterior.sqrt(), rows, count)
+    return FIDELITY * fidelity + _per_state(unexplained * posterior.sqrt(), rows, count)
 
 
 def _unknown(
@@ -201,8 +222,22 @@ def _unknown(
     """How little is known of what actions (B, K) do at x_t (B, 1, ...): (B,), in (0, 1.1)."""
     expected = predicted_chain(world_model, now, actions)
     recognised = _log_prob(inverse.log_prob(SegmentBatch(expected)), actions).exp()
-    sure = (-SHARPNESS * world_model.distance(prediction, future(expected))).exp()
+    doubt = world_model.distance(prediction, future(expected)) - _least(world_model, now, actions.shape[1])
+    sure = (-SHARPNESS * doubt.clamp(min=0.0)).exp()
     return (1.0 - recognised + DOUBT) * (1.0 - sure + DOUBT)
+
+
+def _least(world_model: WorldModel, now: Observations, horizon: int) -> Tensor:
+    """What a prediction of K steps that is certain and right is away all the same: (B,) nats, of x_t as its own."""
+    state = world_model.infer_state(now)
+    still = {name: stream.repeat_interleave(horizon, 1) for name, stream in now.items()}  # (B, K, ...)
+    return world_model.distance(torch.stack([state] * horizon, 1), still)
+
+
+def _possible(log_prob: Tensor) -> Tensor:
+    """h of n actions, none below `UNNAMED`: log_prob (..., n)."""
+    actions = log_prob.shape[-1]
+    return ((log_prob.exp() + UNNAMED) / (1.0 + actions * UNNAMED)).log()
 
 
 def _listed(actions: Tensor, scores: Tensor) -> Explorations:
