@@ -4,17 +4,18 @@ Algorithm 1 executes along the sampled chain with the largest cycle error. What 
 the generator gets wrong: no action leads there. So no chain is believed by itself. At a state x_t, with futures x~_m of
 prior p_m and predictions x^_a = f(z_t, a) of every action, executing a is worth
 
-    0.3 fidelity    -log sum_m w_ma exp(-l(x^_a, x~_m)),   w_ma ~ p_m h(a | x_t, x~_m), summing to 1 over m,
+    fidelity        -log sum_m w_ma exp(-l(x^_a, x~_m)),   w_ma ~ p_m h(a | x_t, x~_m), summing to 1 over m,
   + cycle error     max_m min_b l(x^_b, x~_m) sqrt(q_ma), over the futures that the generator stands by,
     reachability    q_ma ~ sqrt(h(a | x_t, x~_m)) (1 - h(a | x_t, x^_a)) (1 - p(x^_a)^3) / h(a), summing to 1 over a.
 
-The first is large where what the world model says of a is no plausible outcome of it; one wrong future more only lowers
-it. The second is large where something may happen that the world model expects of no action: one of those led there
-that the inverse dynamics names for it, does not recognise in what the world model expects of them, and of which the
-world model is not sure: p(x^_a) is what it gives to its likeliest prediction. h(a) is how often a is inferred at all,
-and no h is below `UNNAMED`: an action that no label shows is never inferred, so else never executed, so never labeled.
+The first, times `FIDELITY`, is large where what the world model says of a is no plausible outcome of it; one wrong
+future more only lowers it. The second is large where something may happen that the world model expects of no action:
+one of those led there that the inverse dynamics names for it, does not recognise in what the world model expects of
+them, and of which the world model is not sure: p(x^_a) is what it gives to its likeliest prediction, over what it would
+give if it were certain. h(a) is how often a is inferred at all, and of futures each h is at least about `UNNAMED`: an
+action that no label shows is never inferred, so else never executed, so never labeled.
 
-A batch is shared out among the actions: each is given as much of it as its best explorations are worth (`order`).
+A batch is shared out among the actions (`order`).
 """
 
 from collections.abc import Callable, Sequence
@@ -105,9 +106,9 @@ def explore(
     for start in range(0, len(next(iter(observations.values()))), chunk):
         states = {name: stream[start : start + chunk] for name, stream in observations.items()}
         futures = subgoals.futures(states, horizon, generator)
-        parts.append(_Imagined(states, futures, _possible(inverse.log_prob(SegmentBatch(futures.chains)))))
+        parts.append(_Imagined(states, futures, inverse.log_prob(SegmentBatch(futures.chains))))
         after_each()
-    usual = torch.cat([part.log_prob[:, 0].exp() for part in parts]).mean(0)
+    usual = torch.cat([_possible(part.log_prob)[:, 0].exp() for part in parts]).mean(0)
     actions, scores = list[Tensor](), list[Tensor]()
     for part in parts:
         actions.append(_candidates(part))
@@ -134,9 +135,9 @@ def order(
     """Rows of `found` that have the `count` highest scores, so ordered that every prefix is a good batch.
 
     Of each state only the best is among them: several actions there may have no effect, whatever the world model
-    expects, and that is one trajectory and one label. The rule orders those of each action; how many of an action a
-    prefix holds goes by D'Hondt's highest averages of what they weigh. Else whatever the world model is wrong about
-    most would be all of a batch. observations: the states (B, ...) that `explore` was given.
+    expects, and that is one trajectory and one label. The best are shared out among the actions, of which the rule
+    orders each one's by themselves: what the world model is wrong about most may all be of one action, and teach one
+    thing. observations: the states (B, ...) that `explore` was given.
     """
     best = _best_of_each(found)
     best = best[top(found.scores[best], count)]
@@ -147,26 +148,34 @@ def order(
         for start in range(0, len(best), chunk):
             rows = best[start : start + chunk]
             states = {name: stream[found.states[rows]].unsqueeze(1) for name, stream in observations.items()}
-            chain = SegmentBatch(predicted_chain(world_model, states, found.actions[rows]))
-            parts.append(description(rule.reads, world_model, chain, found.actions[rows]))
+            actions = found.actions[rows].to(next(iter(states.values())).device)
+            chain = SegmentBatch(predicted_chain(world_model, states, actions))
+            parts.append(description(rule.reads, world_model, chain, actions))
         candidates = Candidates(found.scores[best], **{rule.reads: torch.cat(parts).cpu()})
     return best[_shared_out(rule, candidates, found.actions[best, 0], generator)]
 
 
 def _shared_out(rule: BatchRule, candidates: Candidates, first: Tensor, generator: torch.Generator) -> Tensor:
-    """All candidates, by place. first int64 (M,): the action that each begins with. The n-th of one counts an n-th."""
-    places, counts = [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0, dtype=torch.float64)]
+    """Rows of all candidates so ordered that every prefix is a good batch. first int64 (M,): the actions they begin
+    with.
+
+    As seats are shared out by D'Hondt: the n-th of an action in the rule's order stands for its weight over n, and for
+    no more than the one before it, so that the rule's order holds within an action.
+    """
+    rows, averages = [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0, dtype=torch.float64)]
     for action in sorted(set(first.tolist())):
         own = torch.nonzero(first == action).flatten()
         own = own[rule.order(_some(candidates, own), len(own), generator)]
-        counts.append((weights(candidates.scores[own]) / torch.arange(1, len(own) + 1)).cummin(0).values)
-        places.append(own)
-    return torch.cat(places)[top(torch.cat(counts), candidates.count)]
+        averages.append((weights(candidates.scores[own]) / torch.arange(1, len(own) + 1)).cummin(0).values)
+        rows.append(own)
+    return torch.cat(rows)[top(torch.cat(averages), candidates.count)]
 
 
 def _some(candidates: Candidates, rows: Tensor) -> Candidates:
-    described = (None if table is None else table[rows] for table in (candidates.features, candidates.signatures))
-    return Candidates(candidates.scores[rows], *described)
+    """Those of some rows, described as they were."""
+    described = {name: getattr(candidates, name) for name in ("features", "signatures")}
+    given_ones = {name: table[rows] for name, table in described.items() if table is not None}
+    return Candidates(candidates.scores[rows], **given_ones)
 
 
 @dataclass(frozen=True)
@@ -201,13 +210,14 @@ def _scores(
     """(B, n) nats of actions (B, n, K). usual (n,): how often each is inferred at all."""
     count, futures = imagined.size, imagined.futures
     now = {name: stream.unsqueeze(1) for name, stream in imagined.states.items()}  # (B, 1, ...)
-    state = world_model.infer_state(now)
+    state, inverse_log_prob = world_model.infer_state(now), _possible(imagined.log_prob)
+    least = _least(world_model, state, now, actions.shape[2])
     distances, named, unknown = list[Tensor](), list[Tensor](), list[Tensor]()  # a column an action
     for each in actions.unbind(1):  # (B, K)
         prediction = world_model.rollout(state, each)
         distances.append(world_model.distance(prediction[futures.states], future(futures.chains)))
-        named.append(_log_prob(imagined.log_prob, each[futures.states]))
-        unknown.append(_unknown(world_model, inverse, now, each, prediction).log())
+        named.append(_log_prob(inverse_log_prob, each[futures.states]))
+        unknown.append(_unknown(world_model, inverse, now, each, prediction, least).log())
     distance, inferred, rows = torch.stack(distances, 1), torch.stack(named, 1), futures.states  # (M, n)
     weight = futures.log_prob.unsqueeze(1) + inferred
     fidelity = _logsumexp(weight, rows, count) - _logsumexp(weight - distance, rows, count)
@@ -217,27 +227,33 @@ def _scores(
 
 
 def _unknown(
-    world_model: WorldModel, inverse: DiscreteInverseDynamics, now: Observations, actions: Tensor, prediction: Tensor
+    world_model: WorldModel,
+    inverse: DiscreteInverseDynamics,
+    now: Observations,
+    actions: Tensor,
+    prediction: Tensor,
+    least: Tensor,
 ) -> Tensor:
     """How little is known of what actions (B, K) do at x_t (B, 1, ...): (B,), in (0, 1.1)."""
     expected = predicted_chain(world_model, now, actions)
     recognised = _log_prob(inverse.log_prob(SegmentBatch(expected)), actions).exp()
-    doubt = world_model.distance(prediction, future(expected)) - _least(world_model, now, actions.shape[1])
-    sure = (-SHARPNESS * doubt.clamp(min=0.0)).exp()
+    doubt = (world_model.distance(prediction, future(expected)) - least).clamp(min=0.0)
+    sure = (-SHARPNESS * doubt).exp()
     return (1.0 - recognised + DOUBT) * (1.0 - sure + DOUBT)
 
 
-def _least(world_model: WorldModel, now: Observations, horizon: int) -> Tensor:
-    """What a prediction of K steps that is certain and right is away all the same: (B,) nats, of x_t as its own."""
-    state = world_model.infer_state(now)
+def _least(world_model: WorldModel, state: Tensor, now: Observations, horizon: int) -> Tensor:
+    """How far away K steps are that are certain and right, (B,) nats: those of x_t itself, in which nothing happens.
+
+    state: z_t. A floor under what is decoded is the same for every prediction; an encoder's loss is only like it.
+    """
     still = {name: stream.repeat_interleave(horizon, 1) for name, stream in now.items()}  # (B, K, ...)
     return world_model.distance(torch.stack([state] * horizon, 1), still)
 
 
 def _possible(log_prob: Tensor) -> Tensor:
-    """h of n actions, none below `UNNAMED`: log_prob (..., n)."""
-    actions = log_prob.shape[-1]
-    return ((log_prob.exp() + UNNAMED) / (1.0 + actions * UNNAMED)).log()
+    """log h (..., n) of n actions with `UNNAMED` added to each h, normalised again."""
+    return ((log_prob.exp() + UNNAMED) / (1.0 + log_prob.shape[-1] * UNNAMED)).log()
 
 
 def _listed(actions: Tensor, scores: Tensor) -> Explorations:

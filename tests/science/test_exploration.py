@@ -1,23 +1,38 @@
 """Explore mode: what to execute where, from imagined futures alone."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from models import exploration
 from models.acquisition import BATCH_RULES, EXPLORING, Models
 from models.exploration import Explorations, asked, distinct, explore, looks, order
 from models.families import GRID
 from models.inverse_dynamics.base import DiscreteInverseDynamics
-from models.segments import Observations, at, take
+from models.segments import Observations, SegmentBatch, at, take
 from models.subgoal_generators.grid import GridSubgoalGenerator
 from models.training import TrainingConfig, train
-from models.world_models.grid import GridWorldModel
+from models.world_models.grid import GridWorldModel, GridWorldModelConfig
 from tests.science import toy_grid
 
 CYCLE = EXPLORING["cycle"]
-STATES = 300
+STATES, TOGGLE = 300, 5
+
+
+class NeverInfers:
+    """Inverse dynamics to which no label has shown that one of the actions does anything."""
+
+    def __init__(self, trained: DiscreteInverseDynamics, action: int) -> None:
+        self.trained, self.action = trained, action
+
+    def log_prob(self, batch: SegmentBatch) -> torch.Tensor:
+        """Of every action; next to nothing of that one."""
+        log_prob = self.trained.log_prob(batch).clone()
+        log_prob[..., self.action] = -30.0
+        return log_prob
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +128,46 @@ def test_a_batch_rule_orders_the_best(rule: str, models: Models, states: Observa
     expected = best.sort(descending=True).values[:50]  # one action at a state
     assert len(set(found.states[rows].tolist())) == 50
     torch.testing.assert_close(found.scores[rows].sort(descending=True).values, expected)
+
+
+def test_a_batch_is_shared_out_among_the_actions(models: Models, states: Observations) -> None:
+    """One action is worth more wherever it may be executed; the others weigh a third of it each."""
+    every = torch.arange(STATES)
+    actions = torch.where(every < 200, TOGGLE, every % TOGGLE).unsqueeze(1)
+    found = Explorations(every, actions, torch.where(every < 200, 9.0, 1.0))
+    rows = order(BATCH_RULES["top"], models, states, found, STATES, torch.Generator())
+    assert sorted(rows.tolist()) == every.tolist()
+    assert found.actions[rows[:24], 0].bincount().tolist() == [3, 3, 3, 3, 3, 9]
+    alone = Explorations(every, torch.full((STATES, 1), TOGGLE), torch.linspace(0, 1, STATES))
+    rule = BATCH_RULES["top"]
+    assert order(rule, models, states, alone, 50, torch.Generator()).tolist() == every.flip(0)[:50].tolist()
+    assert order(rule, models, states, found.take(every[:0]), 50, torch.Generator()).tolist() == []
+
+
+def test_an_action_that_is_never_inferred_is_proposed_all_the_same(models: Models, states: Observations) -> None:
+    """Its label is what would show the inverse dynamics that it explains something."""
+    blind: Any = NeverInfers(CYCLE.verifier(models), TOGGLE)
+    found = explore(CYCLE, replace(models, inverse_dynamics=blind), states, 1, torch.Generator())
+    toggles = found.actions[:, 0] == TOGGLE
+    works = outcomes(found, states)["grid"].ne(states["grid"][found.states]).flatten(1).any(1)
+    movement = found.actions[:, 0] < 3
+    assert float(found.scores[toggles & works].median()) > 2 * float(found.scores[movement].median())
+    rows = order(BATCH_RULES["signatures"], models, states, found, STATES, torch.Generator())[:100]
+    assert 10 < int(toggles[rows].sum()) < 50  # nor is all of a batch spent on it
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_prediction_that_is_certain_leaves_no_doubt(steps: int) -> None:
+    """However high the floor under what is decoded."""
+    world_model = GridWorldModel(toy_grid.SPACES, GridWorldModelConfig(floor=0.3), torch.Generator().manual_seed(0))
+    now = {name: stream[:, :1] for name, stream in toy_grid.labeled(9, seed=8).observations.items()}
+    state = world_model.infer_state(now)
+    least = exploration._least(world_model, state, now, steps)
+    still = {name: torch.cat([stream] * steps, 1) for name, stream in now.items()}
+    moved = {**still, "carried": still["carried"] + (still["carried"] == 0).to(torch.uint8)}
+    prediction = torch.stack([state] * steps, 1)
+    torch.testing.assert_close(world_model.distance(prediction, still), least)
+    assert bool((world_model.distance(prediction, moved) > least + 1.0).all())
 
 
 def test_rooms_that_look_the_same_are_one_state(states: Observations) -> None:
