@@ -9,7 +9,8 @@ from sqlalchemy.orm import Session
 
 from models.acquisition import BATCH_RULES, EXPLORING, Cycle, Models
 from models.chance import scoring_generator
-from models.exploration import STATES, Asked, asked, distinct, explore, looks, order
+from models.exploration import STATES, Asked, asked, distinct, explore, looks
+from models.exploration_queue import order
 from models.segments import Observations, at, take
 from service import draws, projects, proposals, rounds, scorings
 from service.scorings import Ranked

@@ -31,9 +31,8 @@ DATA = (
 )
 """What the simulator's own sets depend on."""
 CODE = (*DATA, "models", "workers/data.py", "workers/diagnosis.py", "workers/training.py", "benchmarks/paper")
-"""What results depend on."""
-EXPLORING = ("models/exploration.py", "benchmarks/paper/minigrid/exploration.py")
-"""What only those results depend on that name it under `also`."""
+"""What results depend on; of explore mode's code only those that name it under `also`."""
+EXPLORATION_CODE = ("models/exploration.py", "models/exploration_queue.py", "benchmarks/paper/minigrid/exploration.py")
 TELLING = ("_table", "__main__", "charts", "drawing", "foreign_path", "picked_losses", "statistics", "through_service")
 """How the names of modules end that results do not depend on: they tell of them or ask for them."""
 LIBRARIES = ("gymnasium", "minigrid", "numpy", "torch")
@@ -48,7 +47,7 @@ class Run(Protocol):
         ...
 
     def results(self) -> Json:
-        """Do it. Sources of EXPLORING that they depend on are named under `also`."""
+        """Do it. EXPLORATION_CODE is named under `also` where they depend on it."""
         ...
 
 
@@ -72,7 +71,7 @@ def run_missing(runs: Sequence[Run], out: Path, processes: int, threads: int) ->
     context = multiprocessing.get_context("spawn")
     began = time.monotonic()
     with ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(threads,)) as pool:
-        futures = [pool.submit(do, run, out, code_digest(*EXPLORING)) for run in missing]
+        futures = [pool.submit(do, run, out, code_digest(*EXPLORATION_CODE)) for run in missing]
         try:
             for done, future in enumerate(as_completed(futures), 1):
                 name, seconds = future.result()
@@ -93,7 +92,8 @@ def read(path: Path) -> Json | None:
     if not path.exists():
         return None
     told: Json = json.loads(path.read_text())
-    return told if told.get("code") == code_digest(*told.get("also", ())) else None
+    code = _digests().get(tuple(told.get("also", ())))
+    return told if code is not None and told.get("code") == code else None
 
 
 def result_file(out: Path, run: Run) -> Path:
@@ -101,19 +101,24 @@ def result_file(out: Path, run: Run) -> Path:
     return out / f"{run.name}.json"
 
 
-@cache
 def code_digest(*also: str) -> str:
     """Of what results depend on: the sources in CODE and `also`, Python and the libraries of LIBRARIES."""
-    return sources_digest(*CODE, *also)
+    return _digests()[also]
+
+
+@cache
+def _digests() -> dict[tuple[str, ...], str]:
+    """All at one moment: sources may change while a run lasts, and it began with the earlier ones."""
+    return {also: sources_digest(*CODE, *also) for also in ((), EXPLORATION_CODE)}
 
 
 @cache
 def sources_digest(*names: str) -> str:
     """Of Python files and folders of them below the root, but for modules that only tell; of Python and LIBRARIES.
 
-    Those of EXPLORING count only where they are named themselves.
+    Those of EXPLORATION_CODE count only where they are named themselves.
     """
-    apart = {ROOT / name for name in EXPLORING if name not in names}
+    apart = {ROOT / name for name in EXPLORATION_CODE if name not in names}
     found = {path for name in names for path in _sources(ROOT / name) if not path.stem.endswith(TELLING)}
     files = sorted(found - apart)
     libraries = [f"{name} {version(name)}" for name in LIBRARIES]
@@ -143,7 +148,7 @@ def do(run: Run, out: Path, code: str | None = None) -> tuple[str, float]:
 
     code: the digest of all code with which the benchmark began. Raises RuntimeError where it is another by now.
     """
-    if code not in (None, code_digest(*EXPLORING)):
+    if code not in (None, code_digest(*EXPLORATION_CODE)):
         raise RuntimeError("The code has changed since the benchmark began; start it again.")
     began = time.monotonic()
     found = run.results()

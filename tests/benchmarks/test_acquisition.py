@@ -15,7 +15,7 @@ from benchmarks.paper.minigrid.arms import Arm
 from benchmarks.paper.minigrid.datasets import draw_labels
 from benchmarks.paper.minigrid.loop import Experiment, Plan
 from benchmarks.paper.minigrid.rooms import Rooms
-from benchmarks.paper.runs import do, result_file
+from benchmarks.paper.runs import EXPLORATION_CODE, do, result_file
 from models.acquisition import Models
 from models.acquisition.self_inverse import SelfInverse
 from models.families import GridFamily
@@ -59,6 +59,15 @@ def test_a_run_tells_each_round_with_its_picks_and_errors(out: Path, small_rooms
     assert len(set(picked)) == 300
     assert {"overall", "movement", "interaction", "swap", "left"} <= set(told["rounds"][0]["balanced"])
     assert told["rooms"] == list(small_rooms.words)
+    assert told["also"] == []
+
+
+def test_arms_that_explore_depend_on_its_code(small_rooms: Rooms, tmp_path: Path) -> None:
+    also = {
+        name: ArmRun(Arm.parse(name), 0, small_rooms, tmp_path).also for name in ("explore:top", "explore_random:top")
+    }
+    assert set(also.values()) == {EXPLORATION_CODE}
+    assert [ArmRun(arm, 0, small_rooms, tmp_path).also for arm in ARMS] == [()] * len(ARMS)
 
 
 @dataclass(frozen=True)

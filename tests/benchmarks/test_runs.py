@@ -1,6 +1,7 @@
 """Runs of a benchmark: done once, in their own processes, and a file only of what has ended."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from benchmarks.paper import runs
 from benchmarks.paper.runs import (
-    EXPLORING,
+    EXPLORATION_CODE,
     Json,
     code_digest,
     do,
@@ -73,28 +74,64 @@ def test_results_of_other_code_are_not_told_and_made_again(
     assert [each["doubled"] for each in results([run], out)] == [2]
 
 
-def test_the_codes_digest_turns_on_what_results_depend_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runs, "ROOT", tmp_path)
+@pytest.fixture
+def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A root of other sources, whose digests nobody remembers."""
+    monkeypatch.setattr(runs, "ROOT", tmp_path / "sources")
+    (tmp_path / "sources" / "models").mkdir(parents=True)
+    _forget_digests()
+    yield tmp_path / "sources"
+    _forget_digests()
+
+
+def _forget_digests() -> None:
+    runs._digests.cache_clear()
+    sources_digest.cache_clear()
+
+
+def test_the_codes_digest_turns_on_what_results_depend_on(sources: Path) -> None:
     digests = list[str]()
     for file in ("models/a.py", "models/a.py", "benchmarks/paper/b_table.py", "workers/app.py", "workers/data.py"):
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / file).write_text(f"x = {len(digests)}")
-        digests.append(sources_digest.__wrapped__(*runs.CODE))
+        (sources / file).parent.mkdir(parents=True, exist_ok=True)
+        (sources / file).write_text(f"x = {len(digests)}")
+        _forget_digests()
+        digests.append(code_digest())
     assert digests[0] != digests[1] == digests[2] == digests[3] != digests[4]
 
 
-def test_results_depend_on_explore_mode_where_they_say_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("file", EXPLORATION_CODE)
+def test_results_depend_on_explore_mode_where_they_say_so(sources: Path, file: str) -> None:
     """Else an arm of pool mode would be run again for every change to it."""
-    monkeypatch.setattr(runs, "ROOT", tmp_path)
-    monkeypatch.setattr(runs, "code_digest", lambda *also: sources_digest.__wrapped__(*runs.CODE, *also))
-    source = tmp_path / runs.EXPLORING[0]
-    source.parent.mkdir()
-    source.write_text("x = 0")
-    for number, also in enumerate(((), runs.EXPLORING)):
-        told = {"code": runs.code_digest(*also), "also": also}
-        (tmp_path / f"count{number}.json").write_text(json.dumps(told))
-    source.write_text("x = 1")
-    assert [read(tmp_path / f"count{number}.json") is None for number in (0, 1)] == [False, True]
+    assert (Path(__file__).parents[2] / file).exists()
+    for number, also in enumerate(((), EXPLORATION_CODE)):
+        (sources / f"{number}.json").write_text(json.dumps({"code": code_digest(*also), "also": also}))
+    (sources / "2.json").write_text(json.dumps({"also": ["other.py"]}))
+    (sources / file).parent.mkdir(parents=True, exist_ok=True)
+    (sources / file).write_text("x = 1")
+    _forget_digests()
+    assert [read(sources / f"{number}.json") is None for number in range(3)] == [False, True, True]
+
+
+@dataclass(frozen=True)
+class Edit:
+    """Somebody edits the source meanwhile."""
+
+    source: Path
+    name: str = "edit"
+
+    def results(self) -> Json:
+        """None."""
+        self.source.write_text("x = 2")
+        return {}
+
+
+def test_results_bear_the_digest_of_the_code_that_their_run_began_with(sources: Path) -> None:
+    (sources / "models" / "a.py").write_text("x = 1")
+    began = sources_digest.__wrapped__(*runs.CODE)
+    do(Edit(sources / "models" / "a.py"), sources, code_digest(*EXPLORATION_CODE))
+    assert json.loads((sources / "edit.json").read_text())["code"] == began
+    _forget_digests()
+    assert read(sources / "edit.json") is None
 
 
 def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path: Path, log: Path) -> None:
@@ -109,4 +146,4 @@ def test_code_that_changes_under_a_benchmark_ends_it(tmp_path: Path, log: Path) 
     with pytest.raises(RuntimeError, match="The code has changed since the benchmark began"):
         do(Count(1, log), tmp_path, "earlier")
     assert not log.exists()
-    assert do(Count(1, log), tmp_path, code_digest(*EXPLORING))[0] == "count1"
+    assert do(Count(1, log), tmp_path, code_digest(*EXPLORATION_CODE))[0] == "count1"

@@ -9,7 +9,8 @@ import torch
 
 from models import exploration
 from models.acquisition import BATCH_RULES, EXPLORING, Models
-from models.exploration import Explorations, asked, distinct, explore, looks, order
+from models.exploration import Explorations, asked, distinct, explore, looks
+from models.exploration_queue import order
 from models.families import GRID
 from models.inverse_dynamics.base import DiscreteInverseDynamics
 from models.segments import Observations, SegmentBatch, at, take

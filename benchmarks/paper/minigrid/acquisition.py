@@ -22,7 +22,7 @@ from benchmarks.paper.minigrid.datasets import GROUPS, load_states
 from benchmarks.paper.minigrid.exploration import Exploration
 from benchmarks.paper.minigrid.loop import Experiment, Round, errors, pool_losses, strategy_scores
 from benchmarks.paper.minigrid.rooms import Data, Rooms, add_files
-from benchmarks.paper.runs import EXPLORING, Json, add_options, results, run_missing
+from benchmarks.paper.runs import EXPLORATION_CODE, Json, add_options, results, run_missing
 from models.rank_correlation import kendall, spearman
 from models.segments import SegmentBatch
 from workers.simulators.minigrid_rules import ACTION_NAMES
@@ -50,12 +50,17 @@ class ArmRun:
         """Of its file."""
         return "-".join((self.arm.strategy, self.arm.rule, str(self.seed), *self.rooms.words))
 
+    @property
+    def also(self) -> tuple[str, ...]:
+        """Code that its results depend on beside all others'."""
+        return EXPLORATION_CODE if self.arm.strategy in EXPLORERS else ()
+
     def results(self) -> Json:
         """After every round: model error on each test, rank correlations, what was picked."""
         data = self.rooms.load()
         rounds = [_told(self.arm, found, data) for found in self._experiment(data).rounds()]
-        also = EXPLORING if self.arm.strategy in EXPLORERS else ()
-        return {"arm": self.arm.name, "seed": self.seed, "rooms": self.rooms.words, "also": also, "rounds": rounds}
+        about = {"arm": self.arm.name, "seed": self.seed, "rooms": self.rooms.words, "also": self.also}
+        return {**about, "rounds": rounds}
 
     def _experiment(self, data: Data) -> Experiment:
         """In explore mode with the simulator's states, at which nobody but the labeler looks."""

@@ -18,7 +18,8 @@ from benchmarks.paper.minigrid.datasets import ACTIONS, TUNING, DataSpec
 from benchmarks.paper.minigrid.loop import Experiment, Round
 from models.acquisition import EXPLORING, Models
 from models.chance import scoring_generator
-from models.exploration import STATES, Asked, asked, distinct, explore, looks, order
+from models.exploration import STATES, Asked, asked, distinct, explore, looks
+from models.exploration_queue import order
 from models.segments import Observations, Segment, SegmentBatch, at
 from workers.diagnosis import draw_places
 from workers.explanation import explain
