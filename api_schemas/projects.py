@@ -17,8 +17,8 @@ class LabelingPolicy(Schema):
 
     round_labels: a round starts by itself after this many new pool labels; 0 turns that off.
     label_budget: pool labels that the project may spend in all; None is no limit.
-    batch_rule: how scored segments become a queue, every prefix of which is a batch; "top" is the plain order by score, of
-    explorations each action's.
+    batch_rule: how scored segments become a queue, every prefix of which is a batch; "top" is the plain order by score,
+    of explorations each action's.
     """
 
     strategy: StrategyName = DEFAULT_STRATEGY
