@@ -45,8 +45,7 @@ def order(
 
 
 def _shared_out(rule: BatchRule, candidates: Candidates, first: Tensor, generator: torch.Generator) -> Tensor:
-    """Rows of all candidates so ordered that every prefix is a good batch. first int64 (M,): the actions they begin
-    with.
+    """Rows of all candidates, so ordered that every prefix is a good batch. first int64 (M,): their first actions.
 
     As seats are shared out by D'Hondt: the n-th of an action in the rule's order stands for its weight over n, and for
     no more than the one before it, so that the rule's order holds within an action.
@@ -54,17 +53,10 @@ def _shared_out(rule: BatchRule, candidates: Candidates, first: Tensor, generato
     rows, averages = [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0, dtype=torch.float64)]
     for action in sorted(set(first.tolist())):
         own = torch.nonzero(first == action).flatten()
-        own = own[rule.order(_some(candidates, own), len(own), generator)]
+        own = own[rule.order(candidates.take(own), len(own), generator)]
         averages.append((weights(candidates.scores[own]) / torch.arange(1, len(own) + 1)).cummin(0).values)
         rows.append(own)
     return torch.cat(rows)[top(torch.cat(averages), candidates.count)]
-
-
-def _some(candidates: Candidates, rows: Tensor) -> Candidates:
-    """Those of some rows, described as they were."""
-    described = {name: getattr(candidates, name) for name in ("features", "signatures")}
-    given_ones = {name: table[rows] for name, table in described.items() if table is not None}
-    return Candidates(candidates.scores[rows], **given_ones)
 
 
 def _best_of_each(found: Explorations) -> Tensor:

@@ -97,7 +97,7 @@ def test_the_loop_runs_through_a_celery_worker(scaled: Scaled) -> None:
     first = client.wait_for_round(accepted.round, timeout=JOB_SECONDS)
     assert first.status == "current"
     batch = client.acquire(project.id, 20, wait=JOB_SECONDS)
-    assert (seeds.strategy, batch.strategy, batch.round) == ("random", "confident_cycle", first.id)
+    assert (seeds.strategy, batch.strategy, batch.round) == ("random", "cycle", first.id)
     accepted = run_labeling(client, batch, generator)
     acknowledged += [(receipt.trajectory, receipt.start) for receipt in accepted.receipts]
 

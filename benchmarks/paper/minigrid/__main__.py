@@ -26,7 +26,7 @@ FEW = (
     f"{DEFAULT_STRATEGY}:{DEFAULT_BATCH_RULE}",
     f"uncertainty:{DEFAULT_BATCH_RULE}",
 )
-MANY_SEEDS = (*FEW, f"cycle:{DEFAULT_BATCH_RULE}", f"self_inverse:{DEFAULT_BATCH_RULE}")  # the arms with 10 seeds
+MANY_SEEDS = (*FEW, f"self_inverse:{DEFAULT_BATCH_RULE}")  # the arms with 10 seeds
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Figure 9: what world models predict for each action, in pictures.
 
-    python -m benchmarks.paper.minigrid.predictions --arms random:top confident_cycle:signatures --examples 3
+    python -m benchmarks.paper.minigrid.predictions --arms random:top cycle:signatures --examples 3
 
 For each action a state in which it is effective; below it what happens, and what the world model of each arm predicts
 after its 200 + 3 x 100 labels, those of figure 4d with the same seed. Wrong cells are outlined in red.
@@ -16,6 +16,7 @@ import torch
 from matplotlib.figure import Figure as Picture
 from numpy.typing import NDArray
 
+from api_schemas.strategies import DEFAULT_BATCH_RULE, DEFAULT_STRATEGY
 from benchmarks.figures import Figure, finish
 from benchmarks.paper.minigrid.arms import Arm
 from benchmarks.paper.minigrid.changes import changes
@@ -88,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     add_options(parser, "9")
     add_files(parser)
-    arms = [Arm("random", "top"), Arm("confident_cycle", "signatures")]
+    arms = [Arm("random", "top"), Arm(DEFAULT_STRATEGY, DEFAULT_BATCH_RULE)]
     parser.add_argument("--arms", nargs="+", default=arms, type=Arm.parse)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--examples", type=int, default=3)

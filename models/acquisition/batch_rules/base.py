@@ -36,6 +36,11 @@ class Candidates:
         """M."""
         return len(self.scores)
 
+    def take(self, rows: Tensor) -> "Candidates":
+        """Those of some rows, described as they were."""
+        features, signatures = (None if table is None else table[rows] for table in (self.features, self.signatures))
+        return Candidates(self.scores[rows], features, signatures)
+
 
 class BatchRule(Protocol):
     """Orders scored candidates so that every prefix of the order is a good batch."""
