@@ -11,10 +11,12 @@ Scope = Literal["admin", "acquire", "label", "read"]
 
 
 class KeyCreate(Schema):
-    """What the holder may do; `admin` is everything."""
+    """What the holder may do; `admin` is everything, within the project where one is named."""
 
     name: str = Field(min_length=1, max_length=200)
-    scopes: list[Scope] = Field(min_length=1)
+    scopes: list[Scope] = Field(min_length=1, max_length=4)
+    project: UUID | None = Field(None, description="the only project that the key reaches; null for all")
+    expires_at: Timestamp | None = Field(None, description="from then on the key opens nothing; null for never")
 
 
 class Key(Schema):
@@ -23,6 +25,8 @@ class Key(Schema):
     id: UUID
     name: str
     scopes: list[Scope]
+    project: UUID | None
+    expires_at: Timestamp | None
     created_at: Timestamp
 
 

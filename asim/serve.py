@@ -35,10 +35,11 @@ def serve(settings: Settings, host: str, port: int, runners: int, tell: Tell) ->
         tell: prints one line for a person.
 
     Raises:
-        ServeRefused: the host is not loopback, the port is taken, or the data folder is being served already.
+        ServeRefused: the port is taken, the data folder is being served already, or the host is not loopback and there
+            is no API key.
     """
     if settings.embedded:  # elsewhere every request needs a key
-        _refuse_foreign_host(host)
+        _refuse_foreign_host(host, settings)
     folder = settings.data_folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder), _listening(host, port) as listener, _ended_by_signals():
@@ -80,14 +81,32 @@ class _Server(uvicorn.Server):
             self._on_started()
 
 
-def _refuse_foreign_host(host: str) -> None:
+def _refuse_foreign_host(host: str, settings: Settings) -> None:
+    """Others need a key in any case; where there is none yet, nobody meant to let them in."""
     with contextlib.suppress(ValueError):
         if host == "localhost" or ipaddress.ip_address(host).is_loopback:
             return
-    raise ServeRefused(
-        f"host {host!r} is not a loopback address, and without API keys anyone who reaches it could change the data; "
-        "use --host 127.0.0.1"
-    )
+    if not _has_key(settings):
+        raise ServeRefused(
+            f"host {host!r} is not a loopback address, and there is no API key with which others could be told apart; "
+            "make one with asim key create, or use --host 127.0.0.1"
+        )
+
+
+def _has_key(settings: Settings) -> bool:
+    from service import keys
+    from service.clock import utc_now
+    from service.store.database import migrate, open_database
+
+    url = settings.resolved_database_url()
+    if not settings.database_url and not (settings.data_folder / "asim.db").exists():
+        return False
+    migrate(url)
+    database = open_database(url)
+    with database.read() as session:
+        found = keys.usable(session, utc_now())
+    database.close()
+    return found
 
 
 @contextlib.contextmanager

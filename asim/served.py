@@ -14,13 +14,14 @@ START_SECONDS = 120.0  # the first start on a cold machine reads torch from disk
 
 
 @contextmanager
-def served(folder: Path, runners: int = 1) -> Iterator[str]:
-    """Run `asim serve` on `folder` and a free port; yields its URL. Its output goes to `serve.log` in the folder.
+def served(folder: Path, runners: int = 1, host: str = "127.0.0.1") -> Iterator[str]:
+    """Run `asim serve` on `folder` and a free port of `host`; yields its URL. Its output goes to `serve.log` there.
 
     Raises AsimError where the process ends by itself, with the end of its log.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    argv = [sys.executable, "-m", "asim", "serve", "--data", str(folder), "--port", "0", "--runners", str(runners)]
+    options = {"--data": folder, "--host": host, "--port": 0, "--runners": runners}
+    argv = [sys.executable, "-m", "asim", "serve", *(str(word) for option in options.items() for word in option)]
     log = folder / "serve.log"
     with log.open("w") as output:
         process = subprocess.Popen(argv, stdout=output, stderr=subprocess.STDOUT, process_group=0)  # noqa: S603

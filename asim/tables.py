@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from datetime import UTC
+from datetime import UTC, datetime
+from uuid import UUID
 
 from rich.console import Console
 from rich.table import Table
@@ -10,6 +11,7 @@ from rich.table import Table
 from api_schemas.acquisitions import Acquisition
 from api_schemas.events import Event
 from api_schemas.jobs import Job
+from api_schemas.keys import Key
 from api_schemas.projects import Project
 from api_schemas.rounds import ModelError, ModelErrorCurve, Round
 
@@ -54,6 +56,18 @@ def job_table(jobs: Sequence[Job]) -> Table:
     for job in jobs:
         attempts = f"{job.attempts} of {job.max_attempts}"
         table.add_row(str(job.id), job.kind, job.state, attempts, f"{job.progress:.0%}", job.message, job.error or "")
+    return table
+
+
+def key_table(keys: Sequence[Key], projects: Mapping[UUID, str], now: datetime) -> Table:
+    """One row a key. projects: their names by id."""
+    table = _table("key", "id", "scopes", "project", "expires", "created")
+    for key in keys:
+        expires = "never" if key.expires_at is None else f"{key.expires_at.astimezone(UTC):%Y-%m-%d %H:%M}Z"
+        expired = " (expired)" if key.expires_at is not None and key.expires_at <= now else ""
+        created = f"{key.created_at.astimezone(UTC):%Y-%m-%d %H:%M}Z"
+        of = "all" if key.project is None else projects[key.project]
+        table.add_row(key.name, str(key.id), ", ".join(key.scopes), of, expires + expired, created)
     return table
 
 

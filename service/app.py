@@ -38,7 +38,7 @@ def create_app(settings: Settings | None = None, clock: Callable[[], datetime] =
     )
     app.state.services = open_services(settings, clock)
     problems.install(app)
-    security.install(app, settings)
+    security.install(app, app.state.services)
     for module in (projects, trajectories, acquisitions, labels, rounds, jobs, system):
         app.include_router(module.router)
     app.include_router(page.router)

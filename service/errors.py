@@ -1,7 +1,7 @@
 """Errors of the service: one class an error, each a sentence with a status. The API turns them into problem details."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from uuid import UUID
 
@@ -9,12 +9,14 @@ from api_schemas.errors import InvalidParam, Problem
 
 LONGEST = 200  # characters of a value that are shown
 SHOWN = 5  # steps of two labels that differ
+RETRY_SOON = {"Retry-After": "1"}
 
 
 class ServiceError(Exception):
     """Base of all expected errors. The class name becomes the problem's type, its docstring the title."""
 
     status_code = 400
+    headers: Mapping[str, str] = {}  # of the answer
 
     def __init__(self, detail: str, invalid_params: list[InvalidParam] | None = None) -> None:
         super().__init__(detail)
@@ -111,6 +113,7 @@ class BlobsUnavailable(ServiceError):
     """The blob store is unavailable."""
 
     status_code = 503
+    headers = RETRY_SOON
 
     def __init__(self, key: str, reason: str) -> None:
         super().__init__(f"blob {key}: its store did not do what was asked; nothing was stored, try again: {reason}")
@@ -171,6 +174,7 @@ class KeyBusy(ServiceError):
     """Too many requests use this Idempotency-Key at this moment."""
 
     status_code = 503
+    headers = RETRY_SOON
 
     def __init__(self, key: str) -> None:
         super().__init__(
@@ -292,6 +296,19 @@ class Unauthenticated(ServiceError):
     """A valid API key is needed."""
 
     status_code = 401
+    headers = {"WWW-Authenticate": "Bearer"}
+
+
+class TooManyFailedKeys(ServiceError):
+    """Too many API keys that open nothing came from here."""
+
+    status_code = 429
+
+    def __init__(self, failures: int, seconds: int) -> None:
+        super().__init__(
+            f"authorization: {failures} keys of this machine failed within a minute; try again in {seconds} s"
+        )
+        self.headers = {"Retry-After": str(seconds)}
 
 
 class CrossOrigin(ServiceError):

@@ -53,6 +53,17 @@ def find(session: Session, project_id: UUID, *, lock: bool = False) -> ProjectRo
     return row
 
 
+def named(session: Session, name: str) -> ProjectRow:
+    """The project of that name, or of that id. Raises UnknownResource."""
+    row = pool_queries.project_named(session, name)
+    if row is not None:
+        return row
+    try:
+        return find(session, UUID(name))
+    except ValueError:
+        raise UnknownResource("project", name) from None
+
+
 def change(session: Session, project_id: UUID, patch: ProjectPatch, now: datetime) -> ProjectRow:
     """Change the labeling policy; fields that were not sent stay. A null label_budget lifts the budget.
 

@@ -7,7 +7,7 @@ from pydantic import TypeAdapter
 
 from api_schemas.events import Event
 from api_schemas.jobs import Job
-from api_schemas.keys import Health, KeyCreate, KeyCreated
+from api_schemas.keys import Health, Key, KeyCreate, KeyCreated
 from api_schemas.strategies import Strategy
 from asim.calls.base import Calls, Id
 from asim.calls.waiting import is_done, poll
@@ -69,6 +69,10 @@ class JobCalls(Calls):
     def create_key(self, key: KeyCreate) -> KeyCreated:
         """POST /keys; the secret is told this once."""
         return self._post("/keys", key, KeyCreated)
+
+    def keys(self) -> Iterator[Key]:
+        """GET /keys, all pages: without their secrets."""
+        return self._pages("/keys", Key)
 
     def delete_key(self, key: Id) -> None:
         """DELETE /keys/{id}."""

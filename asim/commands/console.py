@@ -41,8 +41,12 @@ def explain(error: Exception) -> str | None:
         return str(error)
     from pydantic import ValidationError
 
+    from service.errors import ServiceError as Refused  # of commands that work on the database itself
+
     if isinstance(error, ValidationError):
         return "; ".join(_refused(".".join(map(str, each["loc"])), each["msg"]) for each in error.errors())
+    if isinstance(error, Refused):
+        return error.detail
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return None

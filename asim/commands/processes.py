@@ -20,7 +20,9 @@ Data = Annotated[
 
 def serve(
     data: Data = None,
-    host: Annotated[str, typer.Option(help="Loopback address to listen on.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; one that others reach needs an API key.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free port.")] = 8000,
     runners: Annotated[int, typer.Option(min=1, help="Processes that train and score.")] = 1,
 ) -> None:

@@ -4,18 +4,19 @@ import time
 from uuid import UUID
 
 import anyio
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from api_schemas.acquisitions import AcquireRequest, Acquisition, AcquisitionPending, ExtendRequest, ReleaseRequest
 from service import acquisitions, jobs, leases
-from service.api.dependencies import Now, ReadSession, Services, ServicesDep, WriteSession, requires
+from service.api.access import By, CallerDep, by_body, requires
+from service.api.dependencies import Now, ReadSession, Services, ServicesDep, WriteSession
 from service.api.once import Answer, IdempotencyKey, Prefer, answered_once, key_use, wait_seconds
 from service.idempotency import KeyUse
-from service.store.tables import JobRow
+from service.store.tables import AcquisitionRow, JobRow
 
 router = APIRouter(tags=["acquisitions"])
-reader, acquirer = Depends(requires("read")), Depends(requires("acquire"))
+by_acquisition = By(AcquisitionRow, "acquisition")
 POLL_SECONDS = 0.1
 
 
@@ -24,16 +25,17 @@ POLL_SECONDS = 0.1
     status_code=201,
     response_model=Acquisition,
     responses={202: {"model": AcquisitionPending}},
-    dependencies=[acquirer],
+    dependencies=[requires("acquire", by_body)],
 )
 async def acquire(
     request: AcquireRequest,
     held: ServicesDep,
     http: Request,
+    who: CallerDep,
     idempotency_key: IdempotencyKey = None,
     prefer: Prefer = None,
 ) -> Response:
-    use, deadline = key_use(http, idempotency_key, request), time.monotonic() + wait_seconds(prefer)
+    use, deadline = key_use(http, who, idempotency_key, request), time.monotonic() + wait_seconds(prefer)
     answer = await run_in_threadpool(_acquired, held, request, use)
     while answer.status == 202 and time.monotonic() < deadline:  # no thread and no transaction is held meanwhile
         await anyio.sleep(POLL_SECONDS)
@@ -50,19 +52,19 @@ async def acquire(
     return response
 
 
-@router.get("/acquisitions/{acquisition_id}", dependencies=[reader])
+@router.get("/acquisitions/{acquisition_id}", dependencies=[requires("read", by_acquisition)])
 def show_acquisition(acquisition_id: UUID, session: ReadSession, now: Now) -> Acquisition:
     row = leases.find(session, acquisition_id)
     return acquisitions.describe(session, row, now, with_token=False)
 
 
-@router.post("/acquisitions/{acquisition_id}/extend", dependencies=[acquirer])
+@router.post("/acquisitions/{acquisition_id}/extend", dependencies=[requires("acquire", by_acquisition)])
 def extend(acquisition_id: UUID, request: ExtendRequest, session: WriteSession, held: ServicesDep) -> Acquisition:
     row = leases.extend(session, acquisition_id, request.token, request.lease_seconds, held.clock)
     return acquisitions.describe(session, row, held.clock(), with_token=True)
 
 
-@router.post("/acquisitions/{acquisition_id}/release", dependencies=[acquirer])
+@router.post("/acquisitions/{acquisition_id}/release", dependencies=[requires("acquire", by_acquisition)])
 def release(acquisition_id: UUID, request: ReleaseRequest, session: WriteSession, held: ServicesDep) -> Acquisition:
     row = leases.release(session, acquisition_id, request.token, held.clock)
     return acquisitions.describe(session, row, held.clock(), with_token=False)

@@ -3,14 +3,15 @@
 from datetime import datetime
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Request, Response
 
 from api_schemas.base import Page
 from api_schemas.environments import Spaces
 from api_schemas.labels import MOST_SEGMENTS, Label, LabelsAccepted, LabelsRequest
 from service import labels, pool, projects
 from service.actions import check_actions
-from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep, requires
+from service.api.access import CallerDep, by_body, by_query, requires
+from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep
 from service.api.once import Answer, IdempotencyKey, answered_once, kept_answer, key_use
 from service.errors import InvalidField
 from service.idempotency import KeyUse
@@ -20,16 +21,20 @@ from service.store.queries.listing import page
 from service.store.tables import LabelRow, ProjectRow
 
 router = APIRouter(prefix="/labels", tags=["labels"])
-reader, labeler = Depends(requires("read")), Depends(requires("label"))
 
 
-@router.post("", status_code=201, response_model=LabelsAccepted, dependencies=[labeler])
+@router.post("", status_code=201, response_model=LabelsAccepted, dependencies=[requires("label", by_body)])
 def add_labels(
-    request: LabelsRequest, held: ServicesDep, now: Now, http: Request, idempotency_key: IdempotencyKey = None
+    request: LabelsRequest,
+    held: ServicesDep,
+    now: Now,
+    http: Request,
+    who: CallerDep,
+    idempotency_key: IdempotencyKey = None,
 ) -> Response:
     if not request.items and not request.trajectories:
         raise InvalidField("items", [], "must hold a label, or trajectories a labeled trajectory")
-    use = key_use(http, idempotency_key, request)
+    use = key_use(http, who, idempotency_key, request)
     if request.trajectories and (kept := _kept(held, use, now)):
         return kept.response()
     uploads = _store_trajectories(held, request)
@@ -43,7 +48,7 @@ def add_labels(
     return answer.response()
 
 
-@router.get("", dependencies=[reader])
+@router.get("", dependencies=[requires("read", by_query)])
 def list_labels(project: UUID, session: ReadSession, cursor: Cursor = None, limit: PageSize = 100) -> Page[Label]:
     projects.find(session, project)
     rows, after = page(session, LabelRow, [LabelRow.project_id == project], (LabelRow.watermark,), cursor, limit)

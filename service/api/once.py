@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from api_schemas.base import Schema
 from service import idempotency
+from service.api.access import Caller
 from service.errors import InvalidField
 from service.idempotency import KeyUse
 from service.settings import Settings
@@ -43,14 +44,14 @@ class Answer:
         return Response(self.body, self.status, headers, media_type="application/json")
 
 
-def key_use(request: Request, key: str | None, body: Schema) -> KeyUse | None:
+def key_use(request: Request, who: Caller, key: str | None, body: Schema) -> KeyUse | None:
     """What this request's key stands for; None without a key. Raises InvalidField."""
     if key is None:
         return None
     if not re.fullmatch(r"[\x20-\x7e]{1,200}", key):
         raise InvalidField("Idempotency-Key", key, "must be 1 to 200 printable ASCII characters")
     digest = hashlib.sha256(body.model_dump_json().encode()).hexdigest()
-    return KeyUse(request.state.caller, f"{request.method} {request.url.path}", key, digest)
+    return KeyUse(who.name, f"{request.method} {request.url.path}", key, digest)
 
 
 def kept_answer(session: Session, use: KeyUse | None, now: datetime) -> Answer | None:

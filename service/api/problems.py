@@ -1,5 +1,6 @@
 """Every error as problem details, RFC 9457; FastAPI's own included."""
 
+from collections.abc import Mapping
 from http import HTTPStatus
 
 from fastapi import FastAPI, Request
@@ -10,13 +11,13 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
 from api_schemas.errors import PROBLEM_JSON, InvalidParam, Problem
-from service.errors import BodyTooLarge, ServiceError
+from service.api.headers import CORRELATION, HEADERS
+from service.errors import RETRY_SOON, BodyTooLarge, ServiceError
 from service.log import get_logger
 
 log = get_logger("api")
 # A database that is down, full or slow; "internal" is what PostgreSQL calls that it ended an idle transaction.
 OUTAGES = (OperationalError, InterfaceError, InternalError, PoolTimeout)
-HEADERS = {401: {"WWW-Authenticate": "Bearer"}, 503: {"Retry-After": "1"}}  # what a status says beside its body
 
 
 def install(app: FastAPI) -> None:
@@ -26,11 +27,16 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(DataError, _unstorable)
     for unavailable in OUTAGES:
-        app.add_exception_handler(unavailable, _database_error)
+        app.add_exception_handler(unavailable, outage)
     app.add_exception_handler(Exception, _unexpected)
 
 
-def answer(problem: Problem, headers: dict[str, str] | None = None) -> JSONResponse:
+def refusal(request: Request, error: ServiceError) -> JSONResponse:
+    """An expected error as a response."""
+    return answer(error.problem(request.url.path), error.headers)
+
+
+def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """The problem as a response."""
     body = problem.model_dump(mode="json", exclude_none=True)
     return JSONResponse(body, problem.status, headers=headers, media_type=PROBLEM_JSON)
@@ -39,7 +45,7 @@ def answer(problem: Problem, headers: dict[str, str] | None = None) -> JSONRespo
 def _service_error(request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, ServiceError):
         raise error
-    return answer(error.problem(request.url.path), HEADERS.get(error.status_code))
+    return refusal(request, error)
 
 
 def _malformed(request: Request, error: Exception) -> JSONResponse:
@@ -61,7 +67,7 @@ def _http_error(request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, HTTPException):
         raise error
     if error.status_code == HTTPStatus.REQUEST_ENTITY_TOO_LARGE:  # a body that did not say its length beforehand
-        return answer(BodyTooLarge(str(error.detail)).problem(request.url.path))
+        return refusal(request, BodyTooLarge(str(error.detail)))
     title = HTTPStatus(error.status_code).phrase
     problem = _problem(title.lower().replace(" ", "-"), error.status_code, title, str(error.detail), request)
     return answer(problem, dict(error.headers) if error.headers else None)
@@ -73,19 +79,20 @@ def _unstorable(request: Request, error: Exception) -> JSONResponse:
     return answer(_problem("unstorable-value", 422, "A value cannot be stored", detail, request))
 
 
-def _database_error(request: Request, error: Exception) -> JSONResponse:
+def outage(request: Request, error: Exception) -> JSONResponse:
+    """Of the database, as a response."""
     log.error("database_error", path=request.url.path, error=str(error))
     detail = "the database did not answer, or not in time; what was sent is stored as a whole or not at all, try again"
-    return answer(_problem("database-unavailable", 503, "The database is unavailable", detail, request), HEADERS[503])
+    return answer(_problem("database-unavailable", 503, "The database is unavailable", detail, request), RETRY_SOON)
 
 
 def _unexpected(request: Request, error: Exception) -> JSONResponse:
-    # Starlette calls this outside of all middleware, so the request's id is neither bound nor in the answer yet.
+    # Starlette calls this outside of all middleware, so neither the request's id nor the headers are in the answer yet.
     correlation = getattr(request.state, "correlation", "")
     log.error("unexpected_error", path=request.url.path, correlation=correlation, exc_info=error)
     detail = "the service failed; nothing was stored, the log says why"
     problem = _problem("internal-error", 500, "The service failed", detail, request)
-    return answer(problem, {"X-Correlation-ID": correlation})
+    return answer(problem, HEADERS | {CORRELATION: correlation})
 
 
 def _printable(text: str) -> str:

@@ -4,21 +4,23 @@ import hashlib
 from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Header, Response
+from fastapi import APIRouter, Header, Response
 
 from api_schemas.base import Page
 from api_schemas.models import ModelVersion
 from api_schemas.rounds import ModelErrorCurve, Round, RoundCreate
 from service import projects, registry, rounds
-from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession, requires
+from service.api.access import By, by_body, by_query, requires
+from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
 from service.store.queries.listing import page
 from service.store.tables import ModelVersionRow, RoundRow
 
 router = APIRouter(tags=["rounds"])
-reader, admin = Depends(requires("read")), Depends(requires("admin"))
+reader = requires("read", by_query)
+by_round, by_model = By(RoundRow, "round"), By(ModelVersionRow, "model")
 
 
-@router.post("/rounds", status_code=202, dependencies=[admin])
+@router.post("/rounds", status_code=202, dependencies=[requires("admin", by_body)])
 def start_round(request: RoundCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Round:
     project = projects.find(session, request.project, lock=True)
     row = rounds.request(session, project, now, held.settings.job_max_attempts)
@@ -35,7 +37,7 @@ def list_rounds(project: UUID, session: ReadSession, cursor: Cursor = None, limi
     return Page(items=[rounds.describe(session, row) for row in rows], next=after)
 
 
-@router.get("/rounds/{round_id}", dependencies=[reader])
+@router.get("/rounds/{round_id}", dependencies=[requires("read", by_round)])
 def show_round(round_id: UUID, session: ReadSession) -> Round:
     return rounds.describe(session, rounds.find(session, round_id))
 
@@ -62,12 +64,12 @@ def list_models(
     return Page(items=[registry.describe(row) for row in rows], next=after)
 
 
-@router.get("/models/{model_id}", dependencies=[reader])
+@router.get("/models/{model_id}", dependencies=[requires("read", by_model)])
 def show_model(model_id: UUID, session: ReadSession) -> ModelVersion:
     return registry.describe(registry.find(session, model_id))
 
 
-@router.get("/models/{model_id}/weights", response_class=Response, dependencies=[reader])
+@router.get("/models/{model_id}/weights", response_class=Response, dependencies=[requires("read", by_model)])
 def model_weights(model_id: UUID, held: ServicesDep) -> Response:
     with held.database.read() as session:
         row = registry.find(session, model_id)

@@ -1,34 +1,44 @@
-"""Before any handler: what a browser may do, how large a body may be, and which request this is.
+"""Before any handler: who asks, what a browser may do, how large a body may be, and which request this is.
 
-Browsers may use pages of this service's own host only, under this host's names only.
+Browsers may use pages of this service's own host only, under this host's names only. Nobody's body is read before it
+is known that they may send one.
 """
 
 import re
 from http import HTTPStatus
+from ipaddress import ip_address
 from uuid import uuid4
 
 from fastapi import FastAPI, HTTPException, Request
+from fastapi.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service import origin
+from service import keys, origin
 from service.api import problems
-from service.errors import BodyTooLarge, CrossOrigin, ServiceError
+from service.api.access import NO_KEY, ON_THIS_MACHINE, Caller
+from service.api.attempts import FailedKeys
+from service.api.dependencies import Services
+from service.api.headers import CORRELATION, HEADERS
+from service.errors import BodyTooLarge, CrossOrigin, ServiceError, Unauthenticated
 from service.settings import Settings
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-CORRELATION = "X-Correlation-ID"
+PUBLIC = frozenset({"/", "/dashboard", "/openapi.json", "/health/live", "/health/ready"})
+PUBLIC_FOLDER = "/dashboard/"
+FORWARDED = ("forwarded", "x-forwarded-for", "x-real-ip")  # a proxy of this machine speaks for somebody elsewhere
 
 
-def install(app: FastAPI, settings: Settings) -> None:
-    """Refuse foreign Host headers (DNS rebinding), cross-origin writes and bodies over the limit."""
-    app.add_middleware(Guard, settings=settings)
+def install(app: FastAPI, services: Services) -> None:
+    """Refuse foreign Host headers (DNS rebinding), cross-origin writes, strangers and bodies over the limit."""
+    app.add_middleware(Guard, services=services)
 
 
 class Guard:
     """The middleware; plain ASGI, because Starlette's base class copies every request through a task of its own."""
 
-    def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        self._app, self._settings = app, settings
+    def __init__(self, app: ASGIApp, services: Services) -> None:
+        self._app, self._services = app, services
+        self._failed = FailedKeys()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -37,18 +47,48 @@ class Guard:
         request = Request(scope)
         correlation = request.state.correlation = _correlation(request)
         with origin.bound(actor="", correlation=correlation):
-            await self._guarded(request, receive, _naming(send, correlation))
+            await self._guarded(request, receive, _with_headers(send, HEADERS | {CORRELATION: correlation}))
 
     async def _guarded(self, request: Request, receive: Receive, send: Send) -> None:
-        limit = _largest_body(request, self._settings)
+        limit = _largest_body(request, self._services.settings)
         try:
-            _check_host(request, self._settings)
+            _check_host(request, self._services.settings)
             _check_origin(request)
             _check_size(request, limit)
+            await self._admit(request)
         except ServiceError as error:
-            await problems.answer(error.problem(request.url.path))(request.scope, receive, send)
+            await problems.refusal(request, error)(request.scope, receive, send)
+        except problems.OUTAGES as error:
+            await problems.outage(request, error)(request.scope, receive, send)
         else:
             await self._app(request.scope, _bounded(receive, limit), send)
+
+    async def _admit(self, request: Request) -> None:
+        """Say who asks, for handlers, events and logs. Raises Unauthenticated, TooManyFailedKeys."""
+        if request.url.path in PUBLIC or request.url.path.startswith(PUBLIC_FOLDER):
+            return
+        who = await self._caller(request)
+        request.state.caller = who
+        origin.bind_actor(who.actor)
+
+    async def _caller(self, request: Request) -> Caller:
+        shown = request.headers.get("authorization")
+        if shown is None and self._services.settings.embedded and _is_local(request):
+            return ON_THIS_MACHINE
+        scheme, _, secret = (shown or "").partition(" ")
+        if scheme.lower() != "bearer" or not secret.strip():
+            raise Unauthenticated(NO_KEY)
+        return await run_in_threadpool(self._verified, secret.strip(), request.client.host if request.client else "")
+
+    def _verified(self, secret: str, host: str) -> Caller:
+        claimed = keys.named_by(secret)
+        self._failed.check(host, claimed)
+        try:
+            with self._services.database.read() as session:
+                return Caller.of(keys.verify(session, secret, self._services.clock()))
+        except Unauthenticated:
+            self._failed.count(host, claimed)
+            raise
 
 
 def _correlation(request: Request) -> str:
@@ -57,15 +97,18 @@ def _correlation(request: Request) -> str:
     return given if re.fullmatch(r"[A-Za-z0-9._:@-]{1,100}", given) else uuid4().hex
 
 
-def _naming(send: Send, correlation: str) -> Send:
-    """Every answer says by which id logs and events know its request."""
+def _with_headers(send: Send, headers: dict[str, str]) -> Send:
+    """Every answer has these, unless it says otherwise."""
+    encoded = [(name.lower().encode(), value.encode()) for name, value in headers.items()]
 
-    async def named(message: Message) -> None:
+    async def sent(message: Message) -> None:
         if message["type"] == "http.response.start":
-            message["headers"] = [*message.get("headers", []), (CORRELATION.lower().encode(), correlation.encode())]
+            own = list(message.get("headers", []))
+            said = {name.lower() for name, _ in own}
+            message["headers"] = own + [(name, value) for name, value in encoded if name not in said]
         await send(message)
 
-    return named
+    return sent
 
 
 def _largest_body(request: Request, settings: Settings) -> int:
@@ -107,6 +150,16 @@ def _bounded(receive: Receive, limit: int) -> Receive:
         return message
 
     return counted
+
+
+def _is_local(request: Request) -> bool:
+    """Asked by a program of this machine, in its own name."""
+    if any(name in request.headers for name in FORWARDED):
+        return False
+    try:
+        return ip_address(request.client.host if request.client else "").is_loopback
+    except ValueError:
+        return False
 
 
 def _without_port(host: str) -> str:

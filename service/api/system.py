@@ -5,22 +5,25 @@ from datetime import datetime, timedelta
 from importlib.metadata import version
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Response
+from fastapi import APIRouter, Response
 from fastapi.responses import JSONResponse, RedirectResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from api_schemas.keys import Health, KeyCreate, KeyCreated
+from api_schemas.base import Page
+from api_schemas.keys import Health, Key, KeyCreate, KeyCreated
 from api_schemas.strategies import CATALOG, Strategy
 from service import canary, keys, projects, rounds
-from service.api.dependencies import Now, ReadSession, Services, ServicesDep, WriteSession, requires
+from service.api.access import narrowed, requires
+from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep, WriteSession
 from service.log import get_logger
 from service.store.queries import jobs as job_queries
 from service.store.queries import pool as pool_queries
+from service.store.queries.listing import page
+from service.store.tables import KeyRow
 
 router = APIRouter(tags=["system"])
-reader, admin = Depends(requires("read")), Depends(requires("admin"))
 log = get_logger("api")
 WORKER_SILENCE = timedelta(seconds=30)
 
@@ -30,19 +33,25 @@ def home() -> RedirectResponse:
     return RedirectResponse("/dashboard")
 
 
-@router.get("/strategies", dependencies=[reader])
+@router.get("/strategies", dependencies=[requires("read", narrowed)])
 def list_strategies() -> list[Strategy]:
     return list(CATALOG)
 
 
-@router.post("/keys", status_code=201, dependencies=[admin])
+@router.post("/keys", status_code=201, dependencies=[requires("admin")])
 def create_key(request: KeyCreate, session: WriteSession, now: Now, response: Response) -> KeyCreated:
     created = keys.create(session, request, now)
     response.headers["Location"] = f"/keys/{created.id}"
     return created
 
 
-@router.delete("/keys/{key_id}", status_code=204, dependencies=[admin])
+@router.get("/keys", dependencies=[requires("admin")])
+def list_keys(session: ReadSession, cursor: Cursor = None, limit: PageSize = 100) -> Page[Key]:
+    rows, after = page(session, KeyRow, [], (KeyRow.created_at, KeyRow.id), cursor, limit)
+    return Page(items=[keys.describe(row) for row in rows], next=after)
+
+
+@router.delete("/keys/{key_id}", status_code=204, dependencies=[requires("admin")])
 def revoke_key(key_id: UUID, session: WriteSession, now: Now) -> None:
     keys.revoke(session, key_id, now)
 
@@ -68,7 +77,7 @@ def ready(held: ServicesDep, now: Now) -> JSONResponse:
     return JSONResponse(body.model_dump(), 200 if healthy else 503)
 
 
-@router.get("/metrics", response_class=Response, dependencies=[reader])
+@router.get("/metrics", response_class=Response, dependencies=[requires("read")])
 def metrics(session: ReadSession, now: Now) -> Response:
     return Response(generate_latest(_gauges(session, now)), media_type=CONTENT_TYPE_LATEST)
 

@@ -3,14 +3,15 @@
 from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Query, Response, UploadFile
+from fastapi import APIRouter, Query, Response, UploadFile
 
 from api_schemas.base import Page
 from api_schemas.collections import CollectionCreate
 from api_schemas.jobs import Job
 from api_schemas.trajectories import SplitChoice, TrajectoriesAdded, Trajectory
 from service import collections, jobs, pool, projects
-from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession, requires
+from service.api.access import by_body, by_query, requires
+from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
 from service.errors import InvalidField, NoProvenance
 from service.store import codec, npz
 from service.store.queries import labels as label_queries
@@ -19,7 +20,7 @@ from service.store.queries.listing import page
 from service.store.tables import MembershipRow
 
 router = APIRouter(tags=["trajectories"])
-reader, labeler, admin = Depends(requires("read")), Depends(requires("label")), Depends(requires("admin"))
+reader, labeler = requires("read", by_query), requires("label", by_query)
 Start = Annotated[int, Query(ge=0, description="first observation")]
 Length = Annotated[int | None, Query(ge=0, description="transitions after it; default to the end")]
 NPZ = "application/octet-stream"
@@ -89,7 +90,7 @@ def trajectory_provenance(
     return Response(npz.dump(states, extra["metadata"]), media_type=NPZ)
 
 
-@router.post("/collections", status_code=202, dependencies=[admin])
+@router.post("/collections", status_code=202, dependencies=[requires("admin", by_body)])
 def collect(request: CollectionCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Job:
     row = collections.request(session, request, now, held.settings.job_max_attempts)
     response.headers.update({"Location": f"/jobs/{row.id}", "Retry-After": "1"})

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Protocol
 from uuid import UUID, uuid4
 
 import numpy as np
@@ -15,17 +14,10 @@ import pytest
 
 from api_schemas.collections import CollectionCreate
 from api_schemas.rounds import Round
-from asim.cli import main
 from asim.client import Client
 from service.store.database import open_database
 from service.store.tables import RoundRow
-
-
-class Asim(Protocol):
-    """The command line in this process."""
-
-    def __call__(self, *arguments: str, status: int = 0, stderr: bool = False) -> str: ...
-
+from tests.face.conftest import Command
 
 SPACES = {
     "observations": {"grid": {"dtype": "uint8", "shape": [6, 6, 3]}, "carried": {"dtype": "uint8", "shape": [3]}},
@@ -34,19 +26,10 @@ SPACES = {
 
 
 @pytest.fixture
-def asim(url: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Asim:
-    """Runs one command; returns what it printed, on stderr where it has to fail or that is asked for."""
+def asim(url: str, command: Command, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Commands that ask the running service."""
     monkeypatch.setenv("ASIM_URL", url)
-
-    def run(*arguments: str, status: int = 0, stderr: bool = False) -> str:
-        monkeypatch.setattr(sys, "argv", ["asim", *arguments])
-        with pytest.raises(SystemExit) as end:
-            main()
-        printed, complained = capsys.readouterr()
-        assert (end.value.code or 0) == status, printed + complained
-        return complained if status or stderr else printed
-
-    return run
+    return command
 
 
 def recording(path: Path, seed: int, *, labeled: bool) -> Path:
@@ -62,7 +45,7 @@ def recording(path: Path, seed: int, *, labeled: bool) -> Path:
 
 
 @pytest.fixture
-def own(asim: Asim, tmp_path: Path) -> str:
+def own(asim: Command, tmp_path: Path) -> str:
     """A project of the user's own environment, named after the test's folder."""
     (tmp_path / "spaces.json").write_text(json.dumps(SPACES))
     asim("project", "create", tmp_path.name, "--spaces", str(tmp_path / "spaces.json"), "--round-labels", "0")
@@ -70,7 +53,7 @@ def own(asim: Asim, tmp_path: Path) -> str:
 
 
 def test_recordings_are_imported_once_and_labeled_ones_with_their_labels(
-    asim: Asim, url: str, own: str, tmp_path: Path
+    asim: Command, url: str, own: str, tmp_path: Path
 ) -> None:
     plain = [str(recording(tmp_path / f"{seed}.npz", seed, labeled=False)) for seed in range(3)]
     labeled = str(recording(tmp_path / "labeled.npz", 9, labeled=True))
@@ -89,7 +72,7 @@ def test_recordings_are_imported_once_and_labeled_ones_with_their_labels(
 
 
 def test_a_recording_of_more_segments_than_a_request_takes_is_sent_in_several(
-    asim: Asim, own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    asim: Command, own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("asim.importing.MOST_SEGMENTS", 5)
     labeled = [str(recording(tmp_path / f"{seed}.npz", seed, labeled=True)) for seed in (1, 2)]
@@ -99,13 +82,13 @@ def test_a_recording_of_more_segments_than_a_request_takes_is_sent_in_several(
     assert (counts["pool_trajectories"], counts["labeled"]) == (2, 24)
 
 
-def test_a_policy_is_changed_field_by_field(asim: Asim, own: str) -> None:
+def test_a_policy_is_changed_field_by_field(asim: Command, own: str) -> None:
     policy = json.loads(asim("project", "set", own, "--strategy", "random", "--label-budget", "5"))
     assert (policy["strategy"], policy["label_budget"], policy["round_labels"]) == ("random", 5, 0)
     assert re.search(rf"{own} .* random .* 5\b", asim("project", "list"))
 
 
-def test_mistakes_cost_one_sentence(asim: Asim, own: str, tmp_path: Path) -> None:
+def test_mistakes_cost_one_sentence(asim: Command, own: str, tmp_path: Path) -> None:
     (tmp_path / "text.npz").write_text("no npz")
     mistakes = {
         ("project", "show", "nothing"): "no project is named 'nothing'",
@@ -134,7 +117,7 @@ def test_mistakes_cost_one_sentence(asim: Asim, own: str, tmp_path: Path) -> Non
         assert said.count("\n") == 1, said
 
 
-def test_a_batch_that_is_smaller_says_why(asim: Asim, url: str, own: str, tmp_path: Path) -> None:
+def test_a_batch_that_is_smaller_says_why(asim: Command, url: str, own: str, tmp_path: Path) -> None:
     asim("import", own, str(recording(tmp_path / "one.npz", 1, labeled=False)), "--split", "pool")
     with Client(url) as client:
         client.acquire(client.find_project(own).id, 4, wait=60)
@@ -142,7 +125,7 @@ def test_a_batch_that_is_smaller_says_why(asim: Asim, url: str, own: str, tmp_pa
     assert "a smaller batch: 30 were asked for, 8 are left in the pool split" in said
 
 
-def test_states_to_explore_from_come_with_the_actions_to_execute(asim: Asim, own: str, tmp_path: Path) -> None:
+def test_states_to_explore_from_come_with_the_actions_to_execute(asim: Command, own: str, tmp_path: Path) -> None:
     asim("import", own, str(recording(tmp_path / "one.npz", 2, labeled=False)), "--split", "pool")
     printed = asim("acquire", own, "--mode", "explore", "--count", "5")
     assert len(re.findall(r"^\d +[0-9a-f]{64} +\d+ +1 +\[[0-6]\] *$", printed, re.MULTILINE)) == 5
@@ -151,7 +134,7 @@ def test_states_to_explore_from_come_with_the_actions_to_execute(asim: Asim, own
     assert [len(item["actions"]) for item in items] == [1] * 5
 
 
-def test_jobs_are_listed_and_cancelled_and_events_say_who_did_what(asim: Asim, url: str) -> None:
+def test_jobs_are_listed_and_cancelled_and_events_say_who_did_what(asim: Command, url: str) -> None:
     name = f"cancel-{uuid4().hex[:8]}"
     asim("project", "create", name, "--simulator", "minigrid")
     with Client(url) as client:
@@ -173,7 +156,7 @@ def test_jobs_are_listed_and_cancelled_and_events_say_who_did_what(asim: Asim, u
     assert told[0]["correlation"]
 
 
-def test_followed_events_arrive_as_they_happen_until_ctrl_c(asim: Asim, url: str, own: str) -> None:
+def test_followed_events_arrive_as_they_happen_until_ctrl_c(asim: Command, url: str, own: str) -> None:
     argv = [sys.executable, "-m", "asim", "events", own, "--follow", "--url", url]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as following:
         watchdog = threading.Timer(90, following.kill)
@@ -190,12 +173,12 @@ def test_followed_events_arrive_as_they_happen_until_ctrl_c(asim: Asim, url: str
             following.kill()
 
 
-def test_where_nothing_listens_the_url_is_named(asim: Asim) -> None:
+def test_where_nothing_listens_the_url_is_named(asim: Command) -> None:
     said = asim("project", "list", "--url", "http://127.0.0.1:9", status=1)
     assert said.startswith("asim: no answer from http://127.0.0.1:9 to GET /projects")
 
 
-def test_the_error_of_a_project_without_rounds_is_an_empty_table(asim: Asim, own: str, tmp_path: Path) -> None:
+def test_the_error_of_a_project_without_rounds_is_an_empty_table(asim: Command, own: str, tmp_path: Path) -> None:
     picture = tmp_path / "curve.png"
     assert "test loss" in asim("error", own, "--plot", str(picture))
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -203,7 +186,7 @@ def test_the_error_of_a_project_without_rounds_is_an_empty_table(asim: Asim, own
 
 
 def test_what_a_rounds_diagnostics_warn_of_is_said_below_its_error(
-    asim: Asim, own: str, served_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    asim: Command, own: str, served_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     database = open_database(f"sqlite:///{served_folder / 'asim.db'}")
     parts = dict.fromkeys(("mask", "support", "aliasing", "back_action", "back_action_in_support", "ranking"))

@@ -23,6 +23,8 @@ COMMANDS: list[list[str]] = [
     [],
     ["project"],
     ["project", "create"],
+    ["key"],
+    *(["key", name] for name in ("create", "list", "revoke")),
     *([name] for name in ("serve", "worker", "demo", "collect", "import", "acquire", "label", "round", "error")),
     *([name] for name in ("jobs", "cancel", "events")),
 ]

@@ -3,7 +3,7 @@
 from datetime import datetime
 from uuid import UUID, uuid4
 
-from sqlalchemy import BigInteger, Index, String
+from sqlalchemy import BigInteger, ForeignKey, Index, String
 from sqlalchemy.orm import Mapped, mapped_column
 
 from service.store.columns import Row
@@ -54,11 +54,13 @@ class IdempotencyRow(Row):
 
 
 class KeyRow(Row):
-    """An API key: the hash of its secret and what it may do."""
+    """An API key: the hash of its secret and what it may do, in one project or all, until when."""
 
     __tablename__ = "api_key"
     id: Mapped[UUID] = mapped_column(primary_key=True, default=uuid4)
     name: Mapped[str] = mapped_column(String(200))
     secret_sha256: Mapped[str] = mapped_column(String(64))
     scopes: Mapped[list[object]]
+    project_id: Mapped[UUID | None] = mapped_column(ForeignKey("project.id"))
+    expires_at: Mapped[datetime | None]
     created_at: Mapped[datetime]
