@@ -12,6 +12,7 @@ from service import jobs
 from service.store.queries import jobs as queries
 from service.store.tables import JobRow
 
+WORKER_SILENCE = timedelta(seconds=30)  # a worker that said nothing for longer is not counted
 NAMESPACE = UUID("6f1d9f0e-5a3c-4a0b-9a51-0c6f3b1f7d42")
 QUEUES: tuple[Queue, ...] = tuple(queue for queue in get_args(Queue) if queue != "default")  # it carries no job of ours
 

@@ -51,7 +51,7 @@ class Ranked:
 
 def ready(session: Session, project: ProjectRow, requested: str) -> ScoringRow | None:
     """The scoring whose queue may be read at once; None where `usable` has something to start or to wait for."""
-    strategy, round_row = _ranking(session, project, requested)
+    strategy, round_row = ranking(session, project, requested)
     found = queries.newest_ready(session, project.id, strategy, round_row.id if round_row else None)
     if found is None:
         return None
@@ -65,7 +65,7 @@ def usable(session: Session, project: ProjectRow, requested: str, now: datetime,
     Before the first round a strategy that needs models falls back on COLD_START_STRATEGY. A model's scores hold for
     the pool as it was scored; a model-free scoring is made anew when the pool has grown, while the old queue serves on.
     """
-    strategy, round_row = _ranking(session, project, requested)
+    strategy, round_row = ranking(session, project, requested)
     newest = queries.newest_scoring(session, project.id, strategy, round_row.id if round_row else None)
     if newest is None:
         return _request(session, project, strategy, round_row, now, limits)
@@ -184,7 +184,7 @@ def tell(session: Session, scoring: ScoringRow, what: str, now: datetime, **more
     events.record(session, scoring.project_id, f"scoring.{what}", data, now)
 
 
-def _ranking(session: Session, project: ProjectRow, requested: str) -> tuple[str, RoundRow | None]:
+def ranking(session: Session, project: ProjectRow, requested: str) -> tuple[str, RoundRow | None]:
     """The strategy that ranks, and the round under whose models; a cold start has neither round nor choice."""
     current = round_queries.current_round(session, project.id)
     strategy = requested if current or not NEEDS[requested] else COLD_START_STRATEGY

@@ -1,13 +1,14 @@
 """What handlers are given: sessions, stores, the clock. Who is asking: service.api.access."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Annotated
 
 from fastapi import Depends, Query, Request
 from sqlalchemy.orm import Session
 
+from service.api.requests import Answered
 from service.scorings import Limits, limits_of
 from service.settings import Settings
 from service.store.blobs import Blobs
@@ -24,6 +25,7 @@ class Services:
     blobs: Blobs
     provenance: ProvenanceBlobs | None
     clock: Callable[[], datetime]
+    answered: Answered = field(default_factory=Answered)
 
     @property
     def limits(self) -> Limits:

@@ -5,6 +5,7 @@ is known that they may send one.
 """
 
 import re
+import time
 from http import HTTPStatus
 from ipaddress import ip_address
 from uuid import uuid4
@@ -47,7 +48,21 @@ class Guard:
         request = Request(scope)
         correlation = request.state.correlation = _correlation(request)
         with origin.bound(actor="", correlation=correlation):
-            await self._guarded(request, receive, _with_headers(send, HEADERS | {CORRELATION: correlation}))
+            named = _with_headers(send, HEADERS | {CORRELATION: correlation})
+            await self._guarded(request, receive, self._timed(request, named))
+
+    def _timed(self, request: Request, send: Send) -> Send:
+        """Count the answer once it is sent."""
+        began, status = time.monotonic(), 0
+
+        async def sent(message: Message) -> None:
+            nonlocal status
+            status = message.get("status", status)
+            await send(message)
+            if message["type"] == "http.response.body" and not message.get("more_body", False):
+                self._services.answered.tell(request, status, time.monotonic() - began)
+
+        return sent
 
     async def _guarded(self, request: Request, receive: Receive, send: Send) -> None:
         limit = _largest_body(request, self._services.settings)

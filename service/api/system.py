@@ -1,31 +1,29 @@
 """/strategies, /keys, /health and /metrics."""
 
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import datetime
 from importlib.metadata import version
 from uuid import UUID
 
 from fastapi import APIRouter, Response
 from fastapi.responses import JSONResponse, RedirectResponse
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from sqlalchemy.exc import SQLAlchemyError
-from sqlalchemy.orm import Session
 
 from api_schemas.base import Page
 from api_schemas.keys import Health, Key, KeyCreate, KeyCreated
 from api_schemas.strategies import CATALOG, Strategy
-from service import canary, keys, projects, rounds
+from service import canary, keys
 from service.api.access import narrowed, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep, WriteSession
 from service.log import get_logger
+from service.metrics import gauges
 from service.store.queries import jobs as job_queries
-from service.store.queries import pool as pool_queries
 from service.store.queries.listing import page
 from service.store.tables import KeyRow
 
 router = APIRouter(tags=["system"])
 log = get_logger("api")
-WORKER_SILENCE = timedelta(seconds=30)
 
 
 @router.get("/", include_in_schema=False)
@@ -78,8 +76,9 @@ def ready(held: ServicesDep, now: Now) -> JSONResponse:
 
 
 @router.get("/metrics", response_class=Response, dependencies=[requires("read")])
-def metrics(session: ReadSession, now: Now) -> Response:
-    return Response(generate_latest(_gauges(session, now)), media_type=CONTENT_TYPE_LATEST)
+def metrics(session: ReadSession, now: Now, held: ServicesDep) -> Response:
+    told = generate_latest(gauges(session, now)) + generate_latest(held.answered.registry)
+    return Response(told, media_type=CONTENT_TYPE_LATEST)
 
 
 @dataclass(frozen=True)
@@ -96,28 +95,10 @@ def _work_state(held: Services, now: datetime) -> _WorkState | None:
     try:
         with held.database.read() as session:
             return _WorkState(
-                job_queries.live_workers(session, now - WORKER_SILENCE),
+                job_queries.live_workers(session, now - canary.WORKER_SILENCE),
                 canary.ages(session, now),
                 all(canary.healthy(session, now, held.settings.canary_seconds).values()),
             )
     except SQLAlchemyError as error:
         log.warning("database_unreachable", error=str(error))
         return None
-
-
-def _gauges(session: Session, now: datetime) -> CollectorRegistry:
-    """What the database says now, so that the numbers are right whichever process is asked."""
-    registry = CollectorRegistry()
-    jobs = Gauge("asim_jobs", "Jobs by queue and state", ["queue", "state"], registry=registry)
-    for queue, state, count in job_queries.counts_by_state(session):
-        jobs.labels(queue, state).set(count)
-    segments = Gauge("asim_segments", "Pool segments by state", ["project", "state"], registry=registry)
-    loss = Gauge("asim_model_error_loss", "Next-state loss of the newest round, nats", ["project"], registry=registry)
-    for row in pool_queries.projects_in_order(session):
-        counts = projects.describe(session, row, now).counts
-        for state in ("unlabeled", "leased", "labeled"):
-            segments.labels(row.name, state).set(getattr(counts, state))
-        points = rounds.curve(session, row).points
-        if points and points[-1].model_error.loss is not None:
-            loss.labels(row.name).set(points[-1].model_error.loss)
-    return registry

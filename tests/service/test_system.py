@@ -15,7 +15,7 @@ from api_schemas.strategies import STRATEGY_NAMES
 from service import canary, jobs, rounds
 from service.store.tables import ProjectRow
 from tests.service.conftest import Serve
-from tests.service.kit import Served, answers, room
+from tests.service.kit import UNKNOWN, Served, answers, room
 from workers.dispatch import run_next
 
 NAME = 'a "quoted" \\ name'
@@ -149,6 +149,37 @@ def test_metrics_count_segments_jobs_and_the_newest_error(served: Served) -> Non
     assert found["asim_jobs", "score", "done"] == 2
     assert found["asim_jobs", "train", "queued"] == 2
     assert found["asim_model_error_loss", NAME] == 2.5
+    assert found["asim_model_labels", NAME] == 2
+    assert found["asim_rounds", NAME, "queued"] == 1
+    assert found["asim_leases", NAME] == 1
+    assert 0 < found["asim_lease_age_seconds", NAME] < 1
+    assert found["asim_ranked_segments", NAME] == 2
+    assert found["asim_queue_depth", "train"] == 2
+    assert found["asim_queue_depth", "score"] == 0
+    assert found["asim_scoring_rate", NAME] > 0
+    served.clock.advance(60)
+    found = metrics(served)
+    assert 60 < found["asim_lease_age_seconds", NAME] < 61
+    assert 60 < found["asim_queue_age_seconds", "train"] < 61
+    assert found["asim_queue_age_seconds", "score"] == 0
+
+
+def test_answers_are_counted_by_route_and_status(start: Serve) -> None:
+    served = start()
+    project = served.project()
+    for _ in range(3):
+        served.show(project)
+    served.client.get(f"/projects/{UNKNOWN}")
+    served.client.get("/no/such/path")
+    served.client.request("PURGE", "/nowhere")
+    served.client.get("/projects", headers={"Host": "evil.example"})
+    found = metrics(served)
+    assert found["asim_requests_total", "GET", "/projects/{project_id}", "200"] == 3
+    assert found["asim_requests_total", "GET", "/projects/{project_id}", "404"] == 1
+    assert found["asim_requests_total", "POST", "/projects", "201"] == 1
+    assert found["asim_requests_total", "unknown", "unknown", "404"] == 2
+    assert found["asim_requests_total", "unknown", "unknown", "403"] == 1
+    assert found["asim_request_seconds_count", "GET", "/projects/{project_id}"] == 4
 
 
 def test_strategies_are_listed_with_what_they_need(served: Served) -> None:
