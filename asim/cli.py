@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from asim.commands import keys, labeling, processes, projects, work
+from asim.commands import keys, labeling, processes, projects, upkeep, work
 from asim.commands.console import explain
 
 app = typer.Typer(
@@ -27,6 +27,11 @@ app.command("error")(labeling.model_error)
 app.command("jobs")(work.jobs)
 app.command("cancel")(work.cancel)
 app.command("events")(work.events)
+app.command("doctor")(upkeep.doctor)
+app.command("backup")(upkeep.backup)
+app.command("restore")(upkeep.restore)
+app.command("gc")(upkeep.gc)
+app.add_typer(upkeep.db, name="db", help="The database itself: its schema, and its rows in another database.")
 
 
 def main() -> None:

@@ -40,8 +40,7 @@ def serve(settings: Settings, host: str, port: int, runners: int, tell: Tell) ->
     """
     if settings.embedded:  # elsewhere every request needs a key
         _refuse_foreign_host(host, settings)
-    folder = settings.data_folder.absolute()
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = settings.make_data_folder()
     with _locked(folder), _listening(host, port) as listener, _ended_by_signals():
         from service.app import create_app  # after the checks: a refusal comes at once
         from service.store.database import migrate

@@ -19,7 +19,7 @@ def served(folder: Path, runners: int = 1, host: str = "127.0.0.1") -> Iterator[
 
     Raises AsimError where the process ends by itself, with the end of its log.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     options = {"--data": folder, "--host": host, "--port": 0, "--runners": runners}
     argv = [sys.executable, "-m", "asim", "serve", *(str(word) for option in options.items() for word in option)]
     log = folder / "serve.log"

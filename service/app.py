@@ -49,7 +49,7 @@ def open_services(settings: Settings, clock: Callable[[], datetime] = utc_now) -
     """Open database and stores; in embedded mode they are made where they are missing."""
     url = settings.resolved_database_url()
     if settings.embedded:
-        settings.data_folder.mkdir(parents=True, exist_ok=True)
+        settings.make_data_folder()
         migrate(url)
     return Services(
         settings=settings,

@@ -43,6 +43,12 @@ class Settings(BaseSettings):
     allowed_hosts: tuple[str, ...] = ("127.0.0.1", "localhost", "[::1]")
     max_body_bytes: int = Field(default=256 * 2**20, ge=1)
     max_labels_bytes: int = Field(default=64 * 2**20, ge=1)
+    min_free_bytes: int = Field(default=2**30, ge=0, description="of a disk; asim doctor warns below it")
+
+    def make_data_folder(self) -> Path:
+        """The data folder; a new one is this user's alone."""
+        self.data_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return self.data_folder.absolute()
 
     @property
     def embedded(self) -> bool:

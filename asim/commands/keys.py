@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
-from asim.commands.processes import Data, settings_of
+from asim.commands.processes import Data, opened_database, settings_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -82,14 +82,10 @@ def revoke(
 @contextmanager
 def _database(data: "Path | None") -> "Iterator[Database]":
     """The service's own, of the newest schema."""
-    from service.store.database import migrate, open_database
+    from service.store.database import migrate
 
     settings = settings_of(data)
-    settings.data_folder.mkdir(parents=True, exist_ok=True)
-    url = settings.resolved_database_url()
-    migrate(url)
-    database = open_database(url)
-    try:
+    settings.make_data_folder()
+    migrate(settings.resolved_database_url())
+    with opened_database(settings) as database:
         yield database
-    finally:
-        database.close()

@@ -1,6 +1,7 @@
 """asim serve, asim worker, asim demo: the commands that start processes."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +12,7 @@ from asim.commands.console import Key
 
 if TYPE_CHECKING:
     from service.settings import Settings
+    from service.store.database import Database
 
 Data = Annotated[
     Path | None,
@@ -60,6 +62,18 @@ def demo(
     if url is not None and keep is not None:
         raise AsimError(f"--keep {keep}: the service at --url {url} keeps its data itself; give one of the two")
     run_demo(seed, keep, service=None if url is None else Service(url, key, f"demo-{datetime.now(UTC):%Y%m%d-%H%M%S}"))
+
+
+@contextmanager
+def opened_database(settings: "Settings") -> "Iterator[Database]":
+    """The service's own, for a command that works on it directly."""
+    from service.store.database import open_database
+
+    database = open_database(settings.resolved_database_url(), pool_size=2)
+    try:
+        yield database
+    finally:
+        database.close()
 
 
 def settings_of(data: Path | None) -> "Settings":

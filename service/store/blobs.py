@@ -10,7 +10,8 @@ Settings), so that keys are in no URL and no log.
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import timedelta
+from dataclasses import dataclass
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,19 @@ if TYPE_CHECKING:
 log = get_logger("store")
 # obstore's own would keep a request waiting for three minutes; here who asks is told soon, and asks again.
 RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=10)}
+
+
+TRASH = "trash"  # first part of the key of what was discarded
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A blob as a listing shows it."""
+
+    kind: str
+    sha256: str
+    bytes: int
+    modified: datetime
 
 
 class Blobs:
@@ -59,7 +73,7 @@ class Blobs:
             try:
                 data = bytes(self._store.get(key).bytes())
             except FileNotFoundError as error:
-                raise MissingBlob(key) from error
+                data = self._taken_back(key, error)
         found = hashlib.sha256(data).hexdigest()
         if found != sha256:
             raise CorruptBlob(key, sha256, found)
@@ -77,6 +91,38 @@ class Blobs:
             except FileNotFoundError:  # a folder says so, S3 does not
                 return
 
+    def stored(self) -> Iterator[Stored]:
+        """All blobs that are there, in no order. Raises BlobsUnavailable."""
+        for kind in self.kinds:
+            yield from self._listed(kind)
+
+    def discarded(self) -> Iterator[Stored]:
+        """What is in the trash; `modified` is when it went there. Raises BlobsUnavailable."""
+        for kind in self.kinds:
+            yield from self._listed(f"{TRASH}/{kind}")
+
+    def discard(self, kind: str, sha256: str) -> None:
+        """Move a blob to the trash, from which `get` takes it back for whoever still asks. Raises BlobsUnavailable."""
+        key = self._key(kind, sha256)
+        with _reached(key):
+            try:
+                data = self._store.get(key).bytes()
+            except FileNotFoundError:  # somebody was quicker
+                return
+            self._store.put(f"{TRASH}/{key}", data, mode="overwrite")
+        self.delete(kind, sha256)
+
+    def forget(self, kind: str, sha256: str) -> None:
+        """Remove what was discarded, for good. Raises BlobsUnavailable."""
+        key = f"{TRASH}/{self._key(kind, sha256)}"
+        with _reached(key):
+            self._store.delete(key)
+
+    def take_back(self, kind: str, sha256: str) -> None:
+        """Out of the trash again. Raises MissingBlob, CorruptBlob and BlobsUnavailable."""
+        self.get(kind, sha256)
+        self.forget(kind, sha256)
+
     def reachable(self) -> bool:
         """True where the store answers a listing."""
         if isinstance(self._store, LocalStore) and not Path(str(self._store.prefix)).is_dir():
@@ -87,6 +133,23 @@ class Blobs:
             log.warning("blobs_unreachable", error=_sentence(error))
             return False
         return True
+
+    def _taken_back(self, key: str, error: FileNotFoundError) -> bytes:
+        """A blob that was discarded and is asked for: it was no garbage after all."""
+        try:
+            data = bytes(self._store.get(f"{TRASH}/{key}").bytes())
+        except FileNotFoundError:
+            raise MissingBlob(key) from error
+        self._store.put(key, data, mode="overwrite")
+        log.warning("blob_taken_back", key=key)
+        return data
+
+    def _listed(self, prefix: str) -> Iterator[Stored]:
+        with _reached(prefix):
+            for chunk in self._store.list(prefix):
+                for found in chunk:
+                    kind, _, sha256 = found["path"].split("/")[-3:]
+                    yield Stored(kind, sha256, found["size"], found["last_modified"])
 
     def _mend(self, kind: str, sha256: str, data: bytes) -> None:
         """An object of this name may be torn (a crash of an older store, a bad disk): write it again if it is."""

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from alembic import command
 from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.orm import Session, sessionmaker
@@ -67,9 +69,7 @@ def open_database(url: str, pool_size: int = POOL_SIZE) -> Database:
 
 def migrate(url: str, revision: str = "head") -> None:
     """Upgrade the schema to `revision`; at the newest, what is written from now on comes after all that is there."""
-    config = Config()
-    config.set_main_option("script_location", "service.store:migrations")
-    config.set_main_option("path_separator", "os")
+    config = _alembic()
     config.attributes["url"] = url
     command.upgrade(config, revision)
     if revision == "head":
@@ -77,6 +77,23 @@ def migrate(url: str, revision: str = "head") -> None:
         with database.write() as session:
             keep_order(session)
         database.close()
+
+
+def _alembic() -> Config:
+    config = Config()
+    config.set_main_option("script_location", "service.store:migrations")
+    config.set_main_option("path_separator", "os")
+    return config
+
+
+def revision_of(connection: Connection) -> str:
+    """Which migration the database is at; "" before the first."""
+    return MigrationContext.configure(connection).get_current_revision() or ""
+
+
+def newest_revision() -> str:
+    """Which migration this version of the service needs."""
+    return ScriptDirectory.from_config(_alembic()).get_current_head() or ""
 
 
 def _configure_sqlite(connection: DBAPIConnection, _: ConnectionPoolEntry) -> None:

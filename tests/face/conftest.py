@@ -1,35 +1,14 @@
-"""A service of its own for the tests of the face, and the command line in this process."""
+"""A service of its own for the tests of the face."""
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
 
 import pytest
 
-from asim.cli import main
 from asim.served import served
+from tests.command import command
 
-
-class Command(Protocol):
-    """The command line in this process."""
-
-    def __call__(self, *arguments: str, status: int = 0, stderr: bool = False) -> str: ...
-
-
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs one command; returns what it printed, on stderr where it has to fail or that is asked for."""
-
-    def run(*arguments: str, status: int = 0, stderr: bool = False) -> str:
-        monkeypatch.setattr(sys, "argv", ["asim", *arguments])
-        with pytest.raises(SystemExit) as end:
-            main()
-        printed, complained = capsys.readouterr()
-        assert (end.value.code or 0) == status, printed + complained
-        return complained if status or stderr else printed
-
-    return run
+__all__ = ["command"]
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from api_schemas.rounds import Round
 from asim.client import Client
 from service.store.database import open_database
 from service.store.tables import RoundRow
-from tests.face.conftest import Command
+from tests.command import Command
 
 SPACES = {
     "observations": {"grid": {"dtype": "uint8", "shape": [6, 6, 3]}, "carried": {"dtype": "uint8", "shape": [3]}},

@@ -24,9 +24,11 @@ COMMANDS: list[list[str]] = [
     ["project"],
     ["project", "create"],
     ["key"],
+    ["db"],
+    *(["db", name] for name in ("upgrade", "copy")),
     *(["key", name] for name in ("create", "list", "revoke")),
     *([name] for name in ("serve", "worker", "demo", "collect", "import", "acquire", "label", "round", "error")),
-    *([name] for name in ("jobs", "cancel", "events")),
+    *([name] for name in ("jobs", "cancel", "events", "doctor", "backup", "restore", "gc")),
 ]
 
 

@@ -13,10 +13,11 @@ from sqlalchemy import delete
 from service.settings import Settings
 from service.store.columns import Row
 from service.store.database import migrate
+from tests.command import command
 from tests.servers import postgres_database, postgres_server, postgres_url, redis_server, redis_space
 from tests.service.kit import MAX_BODY_BYTES, START, Served, serve
 
-__all__ = ["postgres_server", "postgres_url", "redis_server", "redis_space"]
+__all__ = ["command", "postgres_server", "postgres_url", "redis_server", "redis_space"]
 Serve = Callable[..., Served]
 
 

@@ -11,7 +11,7 @@ from asim.client import Client
 from asim.errors import NotFound, ServiceError
 from asim.served import served
 from service.settings import Settings
-from tests.face.conftest import Command
+from tests.command import Command
 from tests.service.kit import ROOM, Served, serve
 
 FIRST = {"name": "first", "environment": ROOM}

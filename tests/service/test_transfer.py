@@ -1,0 +1,191 @@
+"""Rows in files and in another database are the rows that were there, and the service goes on with them."""
+
+import json
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import pytest
+import zstandard
+from sqlalchemy import func, select
+
+from service.backup import MANIFEST, backup, read_manifest, restore
+from service.errors import BackupExists, NotEmpty, UnreadableBackup
+from service.settings import Settings
+from service.store import transfer
+from service.store.blobs import Blobs
+from service.store.database import migrate, open_database
+from service.store.provenance import ProvenanceBlobs
+from service.store.tables import EventEpochRow, EventRow, MembershipRow
+from tests.service.access_table import fill
+from tests.service.kit import Served, answers, room, serve
+
+APART = {"event_epoch"}  # says by how much this server's transactions are behind
+
+
+def rows_of(url: str) -> dict[str, list[tuple[Any, ...]]]:
+    with transfer.snapshot(url) as connection:
+        return {
+            name: [tuple(row) for row in connection.execute(select(table).order_by(*table.primary_key.columns))]
+            for name, table in transfer.TABLES.items()
+            if name not in APART
+        }
+
+
+@pytest.fixture
+def filled(on_both: Served) -> Served:
+    """A service with one of everything, and things that JSON could spoil."""
+    things = fill(on_both, f'quotes " and \\ and é {uuid4().hex}', 1)
+    batch = on_both.acquire(things.project, 2, strategy="random")
+    assert on_both.label(things.project, answers(batch), batch).status_code == 201
+    return on_both
+
+
+def stores(folder: Path) -> list[Blobs]:
+    return [Blobs(str(folder / "blobs")), ProvenanceBlobs(str(folder / "provenance"))]
+
+
+def own_stores(served: Served) -> list[Blobs]:
+    held = served.services
+    return [held.blobs, *([held.provenance] if held.provenance else [])]
+
+
+def url_of(served: Served) -> str:
+    return served.services.database.engine.url.render_as_string(hide_password=False)
+
+
+def goes_on(url: str, folder: Path, served: Served) -> None:
+    """Everything that was there answers, and what is new comes after it."""
+    again = serve(Settings(data_folder=folder, database_url=url), served.clock)
+    try:
+        for project in served.get("/projects", limit=1000)["items"]:
+            assert again.show(project["id"]) == project
+        project = again.get("/projects", limit=1000)["items"][-1]["id"]
+        again.upload(project, room(99, transitions=6))
+        batch = again.acquire(project, 1, strategy="random")
+        assert again.label(project, answers(batch), batch).status_code == 201
+        newest = again.get("/events", newest=True, limit=1)["items"][0]
+        assert newest["kind"] == "acquisition.labeled"
+    finally:
+        again.close()
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_a_copy_holds_the_same_rows_and_is_a_working_database(
+    filled: Served, kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    target = f"sqlite:///{tmp_path / 'copy.db'}" if kind == "sqlite" else request.getfixturevalue("postgres_url")
+    counts = transfer.copy(url_of(filled), target)
+    assert counts["project"] >= 1
+    assert rows_of(target) == rows_of(url_of(filled))
+    for store in own_stores(filled):
+        for blob in store.stored():
+            next(each for each in stores(tmp_path) if blob.kind in each.kinds).put(
+                blob.kind, store.get(blob.kind, blob.sha256)
+            )
+    goes_on(target, tmp_path, filled)
+    with pytest.raises(NotEmpty, match="the database holds rows of "):
+        transfer.copy(url_of(filled), target)
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_a_backup_restores_rows_and_blobs_into_a_database_of_either_kind(
+    filled: Served, kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    before = rows_of(url_of(filled))
+    made = backup(url_of(filled), own_stores(filled), tmp_path / "backup", filled.clock())
+    assert (made.missing, made.tables["project"].rows) == ([], len(before["project"]))
+    assert made.blobs["trajectories"] >= 1
+    folder = tmp_path / "data"
+    target = f"sqlite:///{folder / 'asim.db'}" if kind == "sqlite" else request.getfixturevalue("postgres_url")
+    folder.mkdir()
+    assert restore(tmp_path / "backup", target, stores(folder)) == made
+    assert rows_of(target) == before
+    goes_on(target, folder, filled)
+    with pytest.raises(NotEmpty):
+        restore(tmp_path / "backup", target, stores(folder))
+
+
+def test_what_is_written_after_a_copy_comes_after_what_was_copied(filled: Served, postgres_url: str) -> None:
+    """Another server may number its transactions from where this one has long been."""
+    with filled.services.database.write() as session:
+        session.execute(EventEpochRow.__table__.update().values(added=10**9))  # type: ignore[attr-defined]
+        newest = session.scalar(select(func.max(EventRow.transaction)))
+        session.add(EventRow(kind="far", data={}, created_at=filled.clock()))
+    try:
+        transfer.copy(url_of(filled), postgres_url)
+    finally:
+        with filled.services.database.write() as session:
+            session.execute(EventEpochRow.__table__.update().values(added=0))  # type: ignore[attr-defined]
+    database = open_database(postgres_url)
+    with database.write() as session:
+        far = session.scalars(select(EventRow.transaction).where(EventRow.kind == "far")).one()
+        assert far >= 10**9 > (newest or 0)
+        session.add(EventRow(kind="next", data={}, created_at=filled.clock()))
+        session.add(_member_like(session.scalars(select(MembershipRow).limit(1)).one()))
+    with database.read() as session:
+        assert session.scalars(select(EventRow.transaction).where(EventRow.kind == "next")).one() > far
+        ids = session.scalars(select(MembershipRow.id)).all()
+        assert len(ids) == len(set(ids)) == max(ids) or max(ids) > len(ids)
+    database.close()
+
+
+def _member_like(row: MembershipRow) -> EventRow:
+    """Any new row that the database numbers."""
+    return EventRow(project_id=row.project_id, kind="numbered", data={}, created_at=row.created_at)
+
+
+def test_a_backup_is_refused_where_one_is(filled: Served, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(BackupExists, match="is not empty"):
+        backup(url_of(filled), own_stores(filled), tmp_path, filled.clock())
+
+
+def test_a_damaged_backup_is_refused_before_any_row_is_written(filled: Served, tmp_path: Path) -> None:
+    made = tmp_path / "backup"
+    backup(url_of(filled), own_stores(filled), made, filled.clock())
+    target = f"sqlite:///{tmp_path / 'target.db'}"
+    migrate(target)
+
+    def refusal(path: Path, content: bytes) -> str:
+        whole = path.read_bytes()
+        path.write_bytes(content)
+        try:
+            with pytest.raises(UnreadableBackup) as caught:
+                restore(made, target, stores(tmp_path / "data"))
+        finally:
+            path.write_bytes(whole)
+        return caught.value.detail
+
+    labels = made / "tables" / f"label{transfer.SUFFIX}"
+    assert "is not the file that the manifest tells of" in refusal(labels, labels.read_bytes()[:-3])
+    blob = next(path for path in (made / "blobs").rglob("*") if path.is_file())
+    assert "whole blobs, its manifest tells of" in refusal(blob, b"torn")
+    manifest = made / MANIFEST
+    assert f"has no readable {MANIFEST}" in refusal(manifest, b"{")
+    told = json.loads(manifest.read_bytes())
+    torn = zstandard.compress(b'["id", "no_such_column"]\n')
+    labels.write_bytes(torn)
+    told["tables"]["label"]["sha256"] = _sha256(torn)
+    assert "no_such_column" in refusal(manifest, json.dumps(told).encode())
+    assert all(rows == [] for rows in rows_of(target).values())
+    assert read_manifest(made).tables["label"].rows > 0
+
+
+def test_a_blob_that_is_missing_is_named_and_the_rest_is_in_the_backup(filled: Served, tmp_path: Path) -> None:
+    blobs = filled.services.blobs
+    lost = next(blob for blob in blobs.stored() if blob.kind == "weights")
+    data = blobs.get("weights", lost.sha256)
+    blobs.delete("weights", lost.sha256)
+    try:
+        made = backup(url_of(filled), own_stores(filled), tmp_path / "backup", filled.clock())
+    finally:
+        blobs.put("weights", data)
+    assert made.missing == [f"weights/{lost.sha256}"]
+    assert made.blobs["trajectories"] >= 1
+
+
+def _sha256(data: bytes) -> str:
+    import hashlib
+
+    return hashlib.sha256(data).hexdigest()
