@@ -15,8 +15,8 @@ class KeyCreate(Schema):
 
     name: str = Field(min_length=1, max_length=200)
     scopes: list[Scope] = Field(min_length=1, max_length=4)
-    project: UUID | None = Field(None, description="the only project that the key reaches; null for all")
-    expires_at: Timestamp | None = Field(None, description="from then on the key opens nothing; null for never")
+    project: UUID | None = Field(default=None, description="the only project that the key reaches; null for all")
+    expires_at: Timestamp | None = Field(default=None, description="from then on the key opens nothing; null for never")
 
 
 class Key(Schema):

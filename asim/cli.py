@@ -15,6 +15,8 @@ app = typer.Typer(
 )
 app.command("serve")(processes.serve)
 app.command("worker")(processes.worker)
+app.command("scheduler")(processes.scheduler)
+app.command("alive")(processes.alive)
 app.command("demo")(processes.demo)
 app.add_typer(projects.app, name="project", help="Create, list, show and change projects.")
 app.add_typer(keys.app, name="key", help="Make, list and revoke API keys, on the service's own database.")

@@ -64,7 +64,9 @@ def open_services(settings: Settings, clock: Callable[[], datetime] = utc_now) -
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     held: Services = app.state.services
     freeze_imports()
-    relay = None if held.settings.embedded else Relay(held.database, held.settings, held.clock)
+    relay = (
+        None if held.settings.embedded or not held.settings.relay else Relay(held.database, held.settings, held.clock)
+    )
     if relay:
         relay.start()
     yield

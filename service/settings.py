@@ -1,9 +1,10 @@
 """The only place that reads the environment: ASIM_* variables, or the defaults of embedded mode."""
 
+import os
 from pathlib import Path
 
 from pydantic import Field
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SecretsSettingsSource, SettingsConfigDict
 
 POOL_SIZE = 48  # more than the 40 threads that handle requests
 
@@ -19,11 +20,26 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix="ASIM_", frozen=True)
 
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """ASIM_SECRETS names a folder with a file for each setting that must not stand in the environment."""
+        folder = os.environ.get("ASIM_SECRETS")
+        secrets = (SecretsSettingsSource(settings_cls, secrets_dir=folder),) if folder else ()
+        return (init_settings, env_settings, *secrets)
+
     data_folder: Path = Path("asim-data")
     database_url: str = ""
     blobs_url: str = ""
     provenance_url: str | None = None
     broker_url: str = ""
+    relay: bool = Field(default=True, description="API processes send jobs to workers; false: asim scheduler does")
     celery_prefix: str = "asim"
     job_lease_seconds: float = Field(default=15.0, gt=0)
     job_max_attempts: int = Field(default=3, ge=1)

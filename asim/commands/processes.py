@@ -46,6 +46,31 @@ def worker(
     work(settings_of(data), queues)
 
 
+def scheduler(data: Data = None) -> None:
+    """Send jobs to Celery workers and take back those of silent ones, where ASIM_RELAY=false keeps the API from it."""
+    from asim.schedule import schedule
+
+    schedule(settings_of(data))
+
+
+def alive(
+    data: Data = None,
+    url: Annotated[str | None, typer.Option(help="Ask whether the API there lives, instead.")] = None,
+) -> None:
+    """Status 0 where a worker or scheduler of this machine was heard of lately: a health check for containers."""
+    from asim.alive import api_answers, heard_of
+    from asim.errors import AsimError
+    from service.clock import utc_now
+
+    if url is not None:
+        if not api_answers(url):
+            raise AsimError(f"{url} does not answer")
+        return
+    with opened_database(settings_of(data)) as database:
+        if not heard_of(database, utc_now()):
+            raise AsimError("no worker or scheduler of this machine was heard of lately")
+
+
 def demo(
     seed: Annotated[int, typer.Option(min=0, envvar="SEED", help="Of data, labels and networks.")] = 0,
     keep: Annotated[Path | None, typer.Option(help="Keep the service's data in this folder.")] = None,

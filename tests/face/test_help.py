@@ -27,7 +27,22 @@ COMMANDS: list[list[str]] = [
     ["db"],
     *(["db", name] for name in ("upgrade", "copy")),
     *(["key", name] for name in ("create", "list", "revoke")),
-    *([name] for name in ("serve", "worker", "demo", "collect", "import", "acquire", "label", "round", "error")),
+    *(
+        [name]
+        for name in (
+            "serve",
+            "worker",
+            "scheduler",
+            "alive",
+            "demo",
+            "collect",
+            "import",
+            "acquire",
+            "label",
+            "round",
+            "error",
+        )
+    ),
     *([name] for name in ("jobs", "cancel", "events", "doctor", "backup", "restore", "gc")),
 ]
 

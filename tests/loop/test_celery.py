@@ -13,27 +13,24 @@ import numpy as np
 import pytest
 from redis import Redis
 
-from api_schemas.collections import CollectionCreate, CollectionLabels
 from api_schemas.jobs import Job
 from api_schemas.keys import KeyCreate
-from api_schemas.projects import LabelingPolicy, Project, ProjectCreate
+from api_schemas.projects import Project
 from asim.client import Client
 from asim.errors import Forbidden
 from service import keys
 from service.clock import utc_now
 from service.store.database import Database, migrate, open_database
 from service.store.tables import JobRow
+from tests.loop.first_round import JOB_SECONDS, START_SECONDS, collected, first_round
 from tests.loop.invariants import check_invariants, retries
 from tests.loop.processes import command_of, eventually, started, stop
 from tests.servers import RedisSpace
-from tests.workers.conftest import ROOM
 from workers.labeling import run_labeling
 
 QUEUES = ("train", "score", "label", "default")
 API = "uvicorn service.app:create_app --factory --port 0"
 WORKER = "celery -A workers.app worker -c 1 --loglevel INFO"
-START_SECONDS = 90.0
-JOB_SECONDS = 120.0
 
 
 @dataclass
@@ -88,16 +85,11 @@ def test_the_loop_runs_through_a_celery_worker(scaled: Scaled) -> None:
     client, generator = scaled.client, np.random.default_rng(0)
     with pytest.raises(Forbidden), Client(scaled.url) as stranger:
         list(stranger.projects())
-    project = _collected(client, 1500)
+    project = collected(client, 1500)
     eventually(lambda: client.health().status == "ok", START_SECONDS, "no worker is alive")
-    seeds = client.acquire(project.id, 60, wait=JOB_SECONDS)
-    accepted = run_labeling(client, seeds, generator)
-    acknowledged = [(receipt.trajectory, receipt.start) for receipt in accepted.receipts]
-    assert accepted.round is not None  # the policy asks for one after 60 labels
-    first = client.wait_for_round(accepted.round, timeout=JOB_SECONDS)
-    assert first.status == "current"
+    first, acknowledged = first_round(client, project, generator)
     batch = client.acquire(project.id, 20, wait=JOB_SECONDS)
-    assert (seeds.strategy, batch.strategy, batch.round) == ("random", "cycle", first.id)
+    assert (batch.strategy, batch.round) == ("cycle", first.id)
     accepted = run_labeling(client, batch, generator)
     acknowledged += [(receipt.trajectory, receipt.start) for receipt in accepted.receipts]
 
@@ -115,26 +107,6 @@ def test_the_loop_runs_through_a_celery_worker(scaled: Scaled) -> None:
     check_invariants(client, scaled.folder, acknowledged)
     _stops_in_the_middle_of_a_job(scaled, project)
     _check_keys(scaled)
-
-
-def _collected(client: Client, transitions: int) -> Project:
-    """A project with a pool and 35 held-out labels."""
-    policy = LabelingPolicy(round_labels=60)
-    project = client.create_project(ProjectCreate(name="scaled", environment=ROOM, policy=policy))
-    pool = CollectionCreate(project=project.id, transitions=transitions, seed=1, split="pool")
-    held_out = CollectionCreate(
-        project=project.id,
-        behavior="balanced",
-        transitions=5000,
-        seed=2,
-        split="held_out",
-        labels=CollectionLabels(per_action=5),
-    )
-    for asked in (pool, held_out):
-        client.wait_for_job(client.collect(asked).id, timeout=START_SECONDS)
-    counts = client.project(project.id).counts
-    assert (counts.pool_segments, counts.held_out_labeled) == (transitions, 35)
-    return project
 
 
 def _stops_in_the_middle_of_a_job(scaled: Scaled, project: Project) -> None:

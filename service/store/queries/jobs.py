@@ -114,8 +114,15 @@ def held_by_process(session: Session, host: str, pids: Sequence[int], now: datet
 
 
 def live_workers(session: Session, since: datetime) -> int:
-    """Workers heard of since then."""
-    return session.scalar(select(func.count()).where(WorkerRow.heartbeat_at >= since)) or 0
+    """Workers heard of since then. A scheduler says too that it is there; it serves no queue."""
+    serving = func.json_array_length(WorkerRow.queues) > 0
+    return session.scalar(select(func.count()).where(WorkerRow.heartbeat_at >= since, serving)) or 0
+
+
+def heard_from_host(session: Session, host: str, since: datetime) -> bool:
+    """True where a worker or scheduler of that machine was heard of since then."""
+    mine = WorkerRow.owner.startswith(f"{host}:", autoescape=True)
+    return session.scalar(select(WorkerRow.owner).where(mine, WorkerRow.heartbeat_at >= since).limit(1)) is not None
 
 
 def forget_workers(session: Session, before: datetime) -> None:

@@ -1,0 +1,136 @@
+"""docker-compose.yml: whole by its specification, careful, and a working loop when its commands run on this machine."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sqlalchemy import make_url
+
+from asim.client import Client
+from tests.compose.compose_file import FILE, OURS, ROOT, Json, Machine, compose, make_secrets, service
+from tests.loop.first_round import START_SECONDS, collected, first_round
+from tests.loop.processes import environment, eventually, free_port, started, stop
+from tests.servers import RedisSpace
+
+BIN = Path(sys.executable).parent
+
+
+def checked(*argv: str) -> None:
+    done = subprocess.run([str(BIN / argv[0]), *argv[1:]], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_file_is_what_the_compose_specification_says() -> None:
+    checked("check-jsonschema", "--builtin-schema", "vendor.compose-spec", str(FILE))
+
+
+def test_the_image_is_built_as_a_linter_likes_it() -> None:
+    checked("hadolint", str(ROOT / "docker" / "Dockerfile"))
+
+
+@pytest.mark.parametrize("name", compose()["services"])
+def test_a_service_is_careful(name: str) -> None:
+    told: Json = service(name)
+    assert re.search(r":\d+\.\d+", told["image"]), "an image is pinned to a version"
+    assert told["read_only"] is True
+    assert told["cap_drop"] == ["ALL"]
+    assert told["security_opt"] == ["no-new-privileges:true"]
+    assert "healthcheck" in told
+    assert told["restart"] == "unless-stopped"
+    assert "privileged" not in told
+    if name != "db":  # PostgreSQL's own entry point gives up root once it owns its folder
+        assert int(told["user"].split(":")[0]) > 0
+    assert not [value for value in told["environment"].values() if "://" in value] if name in OURS else True
+    assert all(port.startswith("127.0.0.1:") for port in told.get("ports", []))
+
+
+def test_training_and_scoring_have_no_way_to_provenance() -> None:
+    for name in ("trainer", "scorer", "scheduler"):
+        assert service(name)["environment"]["ASIM_PROVENANCE_URL"] == ""
+        assert not any("provenance" in volume for volume in service(name).get("volumes", []))
+    for name in ("service", "labeler"):
+        assert "provenance:/provenance" in service(name)["volumes"]
+
+
+def test_secrets_fit_together_and_are_made_once(tmp_path: Path) -> None:
+    secrets = make_secrets(tmp_path)
+    database, broker = make_url(secrets["ASIM_DATABASE_URL"]), make_url(secrets["ASIM_BROKER_URL"])
+    given = service("db")["environment"]
+    assert (database.host, database.username, database.database) == ("db", given["POSTGRES_USER"], given["POSTGRES_DB"])
+    assert database.password == secrets["postgres_password"]
+    assert (broker.host, broker.password) == ("redis", secrets["redis_password"])
+    assert len(set(secrets.values())) == len(secrets)
+    assert min(len(secrets["postgres_password"]), len(secrets["redis_password"])) >= 40
+    assert (tmp_path / "docker" / "secrets").stat().st_mode & 0o077 == 0
+    subprocess.run([str(tmp_path / "docker" / "make-secrets")], check=True)
+    assert (tmp_path / "docker" / "secrets" / "postgres_password").read_text() == secrets["postgres_password"]
+
+
+@pytest.fixture
+def machine(tmp_path: Path, postgres_url: str, redis_space: RedisSpace) -> Machine:
+    """Folders and secrets; the URLs among these lead to servers of this machine."""
+    (tmp_path / "made").mkdir()
+    made = make_secrets(tmp_path / "made")
+    machine = Machine(tmp_path / "machine", free_port())
+    machine.prepare(made | {"ASIM_DATABASE_URL": postgres_url, "ASIM_BROKER_URL": redis_space.url})
+    return machine
+
+
+@pytest.fixture
+def running(machine: Machine, redis_space: RedisSpace) -> Iterator[dict[str, "subprocess.Popen[bytes]"]]:
+    """All of our services, the API first, which brings the schema up to date."""
+    own = {"ASIM_CELERY_PREFIX": redis_space.prefix}  # others use this Redis too
+    with ExitStack() as stack:
+        processes = {}
+        for name in OURS:
+            log = machine.folder / f"{name}.log"
+            processes[name] = started(machine.argv(name), machine.environment(name) | own, log)
+            stack.callback(stop, processes[name])
+            if name == "service":
+                await_health(machine, name)
+        yield processes
+
+
+def await_health(machine: Machine, name: str) -> None:
+    argv, log = health_of(machine, name), machine.folder / f"{name}.log"
+    eventually(lambda: healthy(machine, name, argv), START_SECONDS, lambda: tail(log))
+
+
+def health_of(machine: Machine, name: str) -> list[str]:
+    word, program, *options = service(name)["healthcheck"]["test"]
+    assert (word, program) == ("CMD", "asim")
+    return machine.entered(options)
+
+
+def healthy(machine: Machine, name: str, argv: list[str]) -> bool:
+    own = environment(**machine.environment(name))
+    return subprocess.run(argv, env=own, capture_output=True, timeout=60, check=False).returncode == 0
+
+
+def tail(log: Path) -> str:
+    return log.read_text(errors="replace")[-3000:]
+
+
+def test_the_services_run_the_loop(machine: Machine, running: dict[str, "subprocess.Popen[bytes]"]) -> None:
+    own = environment(**machine.environment("service"))
+    make_key = machine.entered(["key", "create", "admin", "--scope", "admin"])
+    secret = subprocess.run(make_key, env=own, capture_output=True, text=True, check=True).stdout.strip()
+    with Client(machine.url, secret) as client:
+        logs = "\n".join(tail(machine.folder / f"{name}.log") for name in OURS)
+        eventually(lambda: client.health().status == "ok", START_SECONDS, lambda: logs)
+        project = collected(client, 1200)
+        done, labels = first_round(client, project, np.random.default_rng(0))
+        assert len(labels) == 60
+        assert client.model_error(project.id).points[0].round == done.id
+        assert client.acquire(project.id, 5, wait=START_SECONDS).strategy == "cycle"
+    for name in OURS:
+        assert healthy(machine, name, health_of(machine, name)), name
+    assert not list(machine.folder.glob("not-mounted-in-*/provenance"))
+    for name in reversed(OURS):
+        running[name].terminate()
+        assert running[name].wait(40) == 0, tail(machine.folder / f"{name}.log")
