@@ -1,5 +1,6 @@
 """The README's walk-throughs, run from its own text against an `asim serve` of their own."""
 
+import json
 import os
 import re
 import subprocess
@@ -49,5 +50,5 @@ def test_the_settings_table_names_every_setting_with_its_default() -> None:
     rows = dict(re.findall(r"^\| `(ASIM_\w+)` \| `?([^|`]*?)`? \|", README.read_text(), re.MULTILINE))
     named = {f"ASIM_{name.upper()}": field.default for name, field in Settings.model_fields.items()}
     assert set(rows) == set(named)
-    numbers = {name: str(value) for name, value in named.items() if isinstance(value, int | float)}
-    assert {name: float(rows[name]) for name in numbers} == {name: float(value) for name, value in numbers.items()}
+    numbers = {name: value for name, value in named.items() if isinstance(value, int | float)}
+    assert {name: json.loads(rows[name]) for name in numbers} == numbers
