@@ -13,6 +13,7 @@ from sqlalchemy import make_url
 
 from asim.client import Client
 from tests.compose.compose_file import FILE, OURS, ROOT, Json, Machine, compose, make_secrets, service
+from tests.compose.story import check_same_story, scraped
 from tests.loop.first_round import START_SECONDS, collected, first_round
 from tests.loop.processes import environment, eventually, free_port, started, stop
 from tests.servers import RedisSpace
@@ -116,7 +117,9 @@ def tail(log: Path) -> str:
     return log.read_text(errors="replace")[-3000:]
 
 
-def test_the_services_run_the_loop(machine: Machine, running: dict[str, "subprocess.Popen[bytes]"]) -> None:
+def test_the_services_run_the_loop_and_metrics_tell_its_story(
+    machine: Machine, running: dict[str, "subprocess.Popen[bytes]"], postgres_url: str
+) -> None:
     own = environment(**machine.environment("service"))
     make_key = machine.entered(["key", "create", "admin", "--scope", "admin"])
     secret = subprocess.run(make_key, env=own, capture_output=True, text=True, check=True).stdout.strip()
@@ -124,10 +127,21 @@ def test_the_services_run_the_loop(machine: Machine, running: dict[str, "subproc
         logs = "\n".join(tail(machine.folder / f"{name}.log") for name in OURS)
         eventually(lambda: client.health().status == "ok", START_SECONDS, lambda: logs)
         project = collected(client, 1200)
+        story = check_same_story(machine.url, secret, postgres_url)
+        assert story["asim_segments", "scaled", "unlabeled"] == 1200
         done, labels = first_round(client, project, np.random.default_rng(0))
         assert len(labels) == 60
-        assert client.model_error(project.id).points[0].round == done.id
+        point = client.model_error(project.id).points[0]
+        assert point.round == done.id
+        story = check_same_story(machine.url, secret, postgres_url)
+        assert story["asim_rounds", "scaled", "current"] == 1
+        assert story["asim_model_error_loss", "scaled"] == point.model_error.loss
         assert client.acquire(project.id, 5, wait=START_SECONDS).strategy == "cycle"
+        story = check_same_story(machine.url, secret, postgres_url)
+        assert (story["asim_leases", "scaled"], story["asim_segments", "scaled", "leased"]) == (1, 5)
+        told = scraped(machine.url, secret)
+        assert told["asim_requests_total", "POST", "/labels", "201"] == 1
+        assert told["asim_scoring_rate", "scaled"] > 0
     for name in OURS:
         assert healthy(machine, name, health_of(machine, name)), name
     assert not list(machine.folder.glob("not-mounted-in-*/provenance"))
