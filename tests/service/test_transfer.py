@@ -1,9 +1,10 @@
 """Rows in files and in another database are the rows that were there, and the service goes on with them."""
 
 import json
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import pytest
 import zstandard
@@ -17,6 +18,7 @@ from service.store.blobs import Blobs
 from service.store.database import migrate, open_database
 from service.store.provenance import ProvenanceBlobs
 from service.store.tables import EventEpochRow, EventRow, MembershipRow
+from tests.servers import postgres_database
 from tests.service.access_table import fill
 from tests.service.kit import Served, answers, room, serve
 
@@ -32,13 +34,20 @@ def rows_of(url: str) -> dict[str, list[tuple[Any, ...]]]:
         }
 
 
-@pytest.fixture
-def filled(on_both: Served) -> Served:
-    """A service with one of everything, and things that JSON could spoil."""
-    things = fill(on_both, f'quotes " and \\ and é {uuid4().hex}', 1)
-    batch = on_both.acquire(things.project, 2, strategy="random")
-    assert on_both.label(things.project, answers(batch), batch).status_code == 201
-    return on_both
+@pytest.fixture(params=["sqlite", "postgresql"])
+def filled(request: pytest.FixtureRequest, tmp_path: Path, postgres_server: str) -> Iterator[Served]:
+    """A service on a database of its own, with one of everything, and things that JSON could spoil."""
+    with ExitStack() as stack:
+        url = ""  # a file in the data folder
+        if request.param == "postgresql":
+            url = stack.enter_context(postgres_database(postgres_server))
+            migrate(url)
+        served = serve(Settings(data_folder=tmp_path / "source", database_url=url))
+        stack.callback(served.close)
+        things = fill(served, 'quotes " and \\ and é', 1)
+        batch = served.acquire(things.project, 2, strategy="random")
+        assert served.label(things.project, answers(batch), batch).status_code == 201
+        yield served
 
 
 def stores(folder: Path) -> list[Blobs]:
@@ -112,11 +121,7 @@ def test_what_is_written_after_a_copy_comes_after_what_was_copied(filled: Served
         session.execute(EventEpochRow.__table__.update().values(added=10**9))  # type: ignore[attr-defined]
         newest = session.scalar(select(func.max(EventRow.transaction)))
         session.add(EventRow(kind="far", data={}, created_at=filled.clock()))
-    try:
-        transfer.copy(url_of(filled), postgres_url)
-    finally:
-        with filled.services.database.write() as session:
-            session.execute(EventEpochRow.__table__.update().values(added=0))  # type: ignore[attr-defined]
+    transfer.copy(url_of(filled), postgres_url)
     database = open_database(postgres_url)
     with database.write() as session:
         far = session.scalars(select(EventRow.transaction).where(EventRow.kind == "far")).one()
