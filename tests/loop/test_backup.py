@@ -46,6 +46,7 @@ def test_a_backup_under_load_restores_to_a_service_that_goes_on(
     goes_on(restored, acknowledged, served)
 
 
+@pytest.mark.slow
 def test_the_restored_rows_go_to_postgresql_and_the_service_goes_on_there(
     serve: Serve, restored: Serving, tmp_path: Path, postgres_url: str
 ) -> None:
