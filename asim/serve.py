@@ -101,11 +101,8 @@ def _has_key(settings: Settings) -> bool:
     if not settings.database_url and not (settings.data_folder / "asim.db").exists():
         return False
     migrate(url)
-    database = open_database(url)
-    with database.read() as session:
-        found = keys.usable(session, utc_now())
-    database.close()
-    return found
+    with contextlib.closing(open_database(url)) as database, database.read() as session:
+        return keys.usable(session, utc_now())
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """What Prometheus is told of the work. It is read from the database, so whichever process is asked says the same."""
 
+from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
@@ -20,11 +21,12 @@ MEASURES = ("loss", "exact_accuracy", "dynamics_accuracy", "inverse_accuracy")
 def gauges(session: Session, now: datetime) -> CollectorRegistry:
     """All of them as they are now. Times are seconds."""
     registry = CollectorRegistry()
-    names = {row.id: row.name for row in pool_queries.projects_in_order(session)}
+    rows = pool_queries.projects_in_order(session)
+    names = {row.id: row.name for row in rows}
     _jobs(registry, session, now)
     _leases(registry, session, now, names)
     _rounds(registry, session, names)
-    _projects(registry, session, now)
+    _projects(registry, session, now, rows)
     return registry
 
 
@@ -64,7 +66,7 @@ def _rounds(registry: CollectorRegistry, session: Session, names: dict[UUID, str
             found.labels(names[project], status).set(count)
 
 
-def _projects(registry: CollectorRegistry, session: Session, now: datetime) -> None:
+def _projects(registry: CollectorRegistry, session: Session, now: datetime, rows: Sequence[ProjectRow]) -> None:
     segments = Gauge("asim_segments", "Pool segments by state", ["project", "state"], registry=registry)
     held_out = Gauge("asim_held_out_labels", "Labeled held-out segments", ["project"], registry=registry)
     ranked = Gauge("asim_ranked_segments", "Ready to be acquired by the policy", ["project"], registry=registry)
@@ -74,7 +76,7 @@ def _projects(registry: CollectorRegistry, session: Session, now: datetime) -> N
         name: Gauge(f"asim_model_error_{name}", "On held-out labels, newest round", ["project"], registry=registry)
         for name in MEASURES
     }
-    for row in pool_queries.projects_in_order(session):
+    for row in rows:
         counts = projects.describe(session, row, now).counts
         for state in SEGMENT_STATES:
             segments.labels(row.name, state).set(getattr(counts, state))

@@ -1,13 +1,13 @@
 """asim key: API keys, made on the service's own database, so that there is a first one."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import timedelta
 from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
-from asim.commands.processes import Data, opened_database, settings_of
+from asim.commands.processes import Data, settings_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -82,10 +82,11 @@ def revoke(
 @contextmanager
 def _database(data: "Path | None") -> "Iterator[Database]":
     """The service's own, of the newest schema."""
-    from service.store.database import migrate
+    from service.store.database import migrate, open_database
 
     settings = settings_of(data)
     settings.make_data_folder()
-    migrate(settings.resolved_database_url())
-    with opened_database(settings) as database:
+    url = settings.resolved_database_url()
+    migrate(url)
+    with closing(open_database(url, pool_size=1)) as database:
         yield database

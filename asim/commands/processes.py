@@ -1,7 +1,6 @@
 """asim serve, asim worker, asim demo: the commands that start processes."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +11,6 @@ from asim.commands.console import Key
 
 if TYPE_CHECKING:
     from service.settings import Settings
-    from service.store.database import Database
 
 Data = Annotated[
     Path | None,
@@ -61,12 +59,13 @@ def alive(
     from asim.alive import api_answers, heard_of
     from asim.errors import AsimError
     from service.clock import utc_now
+    from service.store.database import open_database
 
     if url is not None:
         if not api_answers(url):
             raise AsimError(f"{url} does not answer")
         return
-    with opened_database(settings_of(data)) as database:
+    with closing(open_database(settings_of(data).resolved_database_url(), pool_size=1)) as database:
         if not heard_of(database, utc_now()):
             raise AsimError("no worker or scheduler of this machine was heard of lately")
 
@@ -87,18 +86,6 @@ def demo(
     if url is not None and keep is not None:
         raise AsimError(f"--keep {keep}: the service at --url {url} keeps its data itself; give one of the two")
     run_demo(seed, keep, service=None if url is None else Service(url, key, f"demo-{datetime.now(UTC):%Y%m%d-%H%M%S}"))
-
-
-@contextmanager
-def opened_database(settings: "Settings") -> "Iterator[Database]":
-    """The service's own, for a command that works on it directly."""
-    from service.store.database import open_database
-
-    database = open_database(settings.resolved_database_url(), pool_size=2)
-    try:
-        yield database
-    finally:
-        database.close()
 
 
 def settings_of(data: Path | None) -> "Settings":

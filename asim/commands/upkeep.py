@@ -1,12 +1,13 @@
 """asim doctor, backup, restore, gc and db: what keeps an installation well. They work on its database and stores."""
 
+from contextlib import closing
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from asim.commands.processes import Data, opened_database, settings_of
+from asim.commands.processes import Data, settings_of
 
 if TYPE_CHECKING:
     from service.settings import Settings
@@ -68,9 +69,10 @@ def gc(
     """Move blobs that nothing refers to into the trash, and empty the trash of what stayed there as long."""
     from service.clock import utc_now
     from service.garbage import collect
+    from service.store.database import open_database
 
     settings = settings_of(data)
-    with opened_database(settings) as database:
+    with closing(open_database(settings.resolved_database_url(), pool_size=1)) as database:
         found = collect(database, _stores(settings), utc_now(), timedelta(hours=grace_hours), dry_run=dry_run)
     for what, blobs in (
         ("moved to the trash", found.discarded),

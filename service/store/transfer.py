@@ -6,7 +6,7 @@ transaction.
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
@@ -33,13 +33,9 @@ Rows = Iterator[Sequence[Any]]
 @contextmanager
 def snapshot(url: str) -> Iterator[Connection]:
     """A connection that sees one moment, however long it reads."""
-    database = open_database(url, pool_size=1)
     level = {} if url.startswith("sqlite") else {"isolation_level": "REPEATABLE READ"}
-    try:
-        with database.engine.connect() as connection:
-            yield connection.execution_options(**level)
-    finally:
-        database.close()
+    with closing(open_database(url, pool_size=1)) as database, database.engine.connect() as connection:
+        yield connection.execution_options(**level)
 
 
 def dump(connection: Connection, folder: Path) -> dict[str, int]:
@@ -90,20 +86,15 @@ def _rows(connection: Connection, table: Table) -> Rows:
 @contextmanager
 def _written(url: str) -> Iterator[tuple[Connection, dict[str, Table]]]:
     """A transaction on an empty database, and its tables as they are there: an older schema has fewer columns."""
-    database = open_database(url, pool_size=1)
-    try:
-        with database.write() as session:
-            connection = session.connection()
-            _check_empty(connection)
-            there = set(inspect(connection).get_table_names())
-            tables = {name: _as_it_is(connection, table) for name, table in TABLES.items() if name in there}
-            connection.execute(delete(tables[FIXED]))
-            yield connection, tables
-            _count_on(session, tables.values())
-            session.flush()
-            keep_order(session)
-    finally:
-        database.close()
+    with closing(open_database(url, pool_size=1)) as database, database.write() as session:
+        connection = session.connection()
+        _check_empty(connection)
+        there = set(inspect(connection).get_table_names())
+        tables = {name: _as_it_is(connection, table) for name, table in TABLES.items() if name in there}
+        connection.execute(delete(tables[FIXED]))
+        yield connection, tables
+        _count_on(session, tables.values())
+        keep_order(session)
 
 
 def _check_empty(connection: Connection) -> None:
