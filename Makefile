@@ -6,7 +6,7 @@ export PYTHONSAFEPATH := 1
 SEED ?= 0
 REPEAT ?= 50
 
-.PHONY: help setup system demo serve test test-slow lint types imports format bench-acquire bench-score bench-paper-minigrid \
+.PHONY: help setup system demo serve test test-slow audit lint types imports format bench-acquire bench-score bench-paper-minigrid \
 	bench-paper-minigrid-full clean
 .DEFAULT_GOAL := help
 
@@ -38,6 +38,10 @@ test: setup lint types imports ## what CI runs: lint, types, import contracts, t
 test-slow: setup ## the long tests: kills at random moments, scale (REPEAT=5 shortens the kills; ASIM_TEST_SEED=n repeats)
 	scripts/system-packages all
 	REPEAT=$(REPEAT) $(BIN)/python -m pytest -m slow
+
+audit: setup ## known vulnerabilities of everything installed (asks PyPI; says so and fails where it cannot)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[audit]'
+	$(BIN)/pip-audit --strict --skip-editable --progress-spinner off
 
 lint: setup ## ruff
 	$(BIN)/ruff check .

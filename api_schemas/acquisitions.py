@@ -5,7 +5,7 @@ from uuid import UUID
 
 from pydantic import Field, model_validator
 
-from api_schemas.base import Schema, Timestamp, TrajectoryId
+from api_schemas.base import Integer, Number, Schema, Timestamp, TrajectoryId
 from api_schemas.labels import Action
 from api_schemas.projects import Budget
 from api_schemas.strategies import StrategyName
@@ -23,11 +23,11 @@ class AcquireRequest(Schema):
     """
 
     project: UUID
-    count: int = Field(ge=1, le=10_000)
+    count: Integer = Field(ge=1, le=10_000)
     mode: Mode = "pool"
     strategy: str | None = None
     purpose: Purpose = "pool"
-    lease_seconds: float | None = Field(default=None, gt=0, le=30 * 86400)
+    lease_seconds: Number | None = Field(default=None, gt=0, le=30 * 86400)
     labeler: str = Field(default="", max_length=200, description="a name for who will answer; shown, never checked")
 
     @model_validator(mode="after")
@@ -90,11 +90,11 @@ class AcquisitionPending(Schema):
 class ExtendRequest(Schema):
     """Move the lease's end to `lease_seconds` from now."""
 
-    token: int
-    lease_seconds: float | None = Field(default=None, gt=0, le=30 * 86400)
+    token: Integer
+    lease_seconds: Number | None = Field(default=None, gt=0, le=30 * 86400)
 
 
 class ReleaseRequest(Schema):
     """Give back the segments that are not labeled yet."""
 
-    token: int
+    token: Integer

@@ -2,11 +2,22 @@
 
 from typing import Annotated, Generic, Literal, TypeVar
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, Strict
 
 Timestamp = AwareDatetime
 TrajectoryId = Annotated[str, Field(pattern="^[0-9a-f]{64}$", description="sha256 of the trajectory's decoded arrays")]
 Split = Literal["pool", "held_out"]
+
+
+def _number(value: object) -> object:
+    """In a body true is no 1, and "5" no 5; 5.0 is 5, as JSON has it."""
+    if isinstance(value, bool | str | bytes):
+        raise ValueError("must be a number")
+    return value
+
+
+Integer = Annotated[int, BeforeValidator(_number)]
+Number = Annotated[float, Strict()]
 Item = TypeVar("Item")
 
 
@@ -23,4 +34,4 @@ class Page(Schema, Generic[Item]):
     next: str | None = None
 
 
-__all__ = ["Page", "Schema", "Split", "Timestamp", "TrajectoryId"]
+__all__ = ["Integer", "Number", "Page", "Schema", "Split", "Timestamp", "TrajectoryId"]

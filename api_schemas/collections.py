@@ -4,14 +4,14 @@ from uuid import UUID
 
 from pydantic import Field
 
-from api_schemas.base import Schema
+from api_schemas.base import Integer, Schema
 from api_schemas.trajectories import SplitChoice
 
 
 class CollectionLabels(Schema):
     """Record labels for `per_action` effective transitions of each action (one that changes the observation)."""
 
-    per_action: int = Field(ge=1)
+    per_action: Integer = Field(ge=1)
 
 
 class CollectionCreate(Schema):
@@ -23,7 +23,7 @@ class CollectionCreate(Schema):
 
     project: UUID
     behavior: str = Field(default="mixture", min_length=1, max_length=80)
-    transitions: int = Field(ge=1, le=10_000_000)
-    seed: int = Field(default=0, ge=0, lt=2**31)
+    transitions: Integer = Field(ge=1, le=10_000_000)
+    seed: Integer = Field(default=0, ge=0, lt=2**31)
     split: SplitChoice = "auto"
     labels: CollectionLabels | None = None

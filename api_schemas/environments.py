@@ -1,16 +1,38 @@
 """Observation and action spaces of a project, and the spaces of the simulators that we ship."""
 
 from collections.abc import Callable, Mapping
+from math import prod
 from typing import Annotated, Literal
 
-from pydantic import Field, PositiveInt, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from api_schemas.base import Schema
+from api_schemas.base import Integer, Number, Schema
 
+MOST_AXES = 8  # of one array, time not counted
+MOST_NUMBERS = 2**24  # of one observation in one stream
+MOST_COORDINATES = 1_000  # of an action
+MOST_ACTIONS = 1_000  # of a discrete space
+MOST_ENTRIES = 64  # streams of an observation, groups of actions, options of a simulator
 DType = Literal["uint8", "int32", "int64", "float32", "float64"]
 
 
 StreamName = Annotated[str, Field(pattern="^[A-Za-z0-9_.-]{1,80}$")]  # a slash would name a chunk of another stream
+
+
+def _at_most(most: int) -> AfterValidator:
+    """Of all axes together."""
+
+    def check(shape: tuple[int, ...]) -> tuple[int, ...]:
+        if prod(shape) > most:
+            raise ValueError(f"holds {prod(shape)} numbers, {most} are allowed")
+        return shape
+
+    return AfterValidator(check)
+
+
+Name = Annotated[str, Field(max_length=200)]
+Axis = Annotated[Integer, Field(gt=0, le=MOST_NUMBERS)]
+Shape = Annotated[tuple[Axis, ...], Field(max_length=MOST_AXES)]
 
 
 class Stream(Schema):
@@ -20,8 +42,8 @@ class Stream(Schema):
     """
 
     dtype: DType
-    shape: tuple[PositiveInt, ...]
-    high: int | tuple[int, ...] | None = None
+    shape: Annotated[Shape, _at_most(MOST_NUMBERS)]
+    high: Integer | Annotated[tuple[Integer, ...], Field(max_length=MOST_NUMBERS)] | None = None
 
     @model_validator(mode="after")
     def _high_fits_the_last_axis(self) -> "Stream":
@@ -34,18 +56,20 @@ class DiscreteActions(Schema):
     """The integers 0 to n - 1. `groups` names disjoint sets of them for which model error is reported apart."""
 
     kind: Literal["discrete"] = "discrete"
-    n: int = Field(ge=2)
-    names: tuple[str, ...] = ()
-    groups: dict[str, tuple[int, ...]] = {}
+    n: Integer = Field(ge=2, le=MOST_ACTIONS)
+    names: Annotated[tuple[Name, ...], Field(max_length=MOST_ACTIONS)] = ()
+    groups: Annotated[
+        dict[Name, Annotated[tuple[Integer, ...], Field(max_length=MOST_ACTIONS)]], Field(max_length=MOST_ENTRIES)
+    ] = {}
 
 
 class BoxActions(Schema):
     """Vectors of `shape` between `low` and `high`, in every coordinate."""
 
     kind: Literal["box"] = "box"
-    shape: tuple[int, ...]
-    low: float = -1.0
-    high: float = 1.0
+    shape: Annotated[Shape, _at_most(MOST_COORDINATES)]
+    low: Number = -1.0
+    high: Number = 1.0
 
 
 Actions = Annotated[DiscreteActions | BoxActions, Field(discriminator="kind")]
@@ -54,7 +78,7 @@ Actions = Annotated[DiscreteActions | BoxActions, Field(discriminator="kind")]
 class Spaces(Schema):
     """What an observation and an action of a project look like."""
 
-    observations: dict[StreamName, Stream] = Field(min_length=1)
+    observations: dict[StreamName, Stream] = Field(min_length=1, max_length=MOST_ENTRIES)
     actions: Actions
 
 
@@ -63,9 +87,9 @@ class MiniGridOptions(Schema):
 
     task: Literal["key_delivery", "ball_delivery", "object_matching", "any"] = "any"
     room_size: Literal[6, 8] = 6
-    objects: int = Field(default=3, ge=3, le=14)
-    noisy_tiles: int = Field(default=0, ge=0, le=4)
-    max_steps: int = Field(default=120, ge=1)
+    objects: Integer = Field(default=3, ge=3, le=14)
+    noisy_tiles: Integer = Field(default=0, ge=0, le=4)
+    max_steps: Integer = Field(default=120, ge=1)
 
     @model_validator(mode="after")
     def _room_for_the_objects(self) -> "MiniGridOptions":
@@ -113,8 +137,8 @@ SIMULATOR_SPACES: dict[str, Callable[[Mapping[str, object]], Spaces]] = {"minigr
 class Environment(Schema):
     """A simulator that we ship (its spaces follow), or the spaces of the user's own robot."""
 
-    simulator: str | None = None
-    options: dict[str, str | int | float | bool] = {}
+    simulator: Name | None = None
+    options: Annotated[dict[Name, Name | int | float | bool], Field(max_length=MOST_ENTRIES)] = {}
     spaces: Spaces | None = None
 
     @model_validator(mode="after")

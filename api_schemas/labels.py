@@ -1,14 +1,22 @@
 """Labels: the actions of a segment, accepted once and never overwritten."""
 
-from typing import Literal
+from typing import Annotated, Literal
 from uuid import UUID
 
 from pydantic import Base64Bytes, Field, StrictInt, model_validator
 
-from api_schemas.base import Schema, Split, Timestamp, TrajectoryId
+from api_schemas.base import Integer, Number, Schema, Split, Timestamp, TrajectoryId
+from api_schemas.environments import MOST_ACTIONS, MOST_COORDINATES
 from api_schemas.trajectories import SplitChoice
 
-Action = StrictInt | list[float]
+MOST_STEPS = 1_000_000  # of one segment or trajectory
+Vector = Annotated[list[Number], Field(max_length=MOST_COORDINATES, fail_fast=True)]
+Action = StrictInt | Vector
+# A list ends at its first error: with one for each wrong step, a body could ask for a thousand times its size.
+Steps = Annotated[list[Action], Field(min_length=1, max_length=MOST_STEPS, fail_fast=True)]
+Choices = Annotated[list[StrictInt], Field(max_length=MOST_ACTIONS, fail_fast=True)]
+ActionSets = Annotated[list[Choices], Field(max_length=MOST_STEPS, fail_fast=True)]
+Starts = Annotated[list[Integer], Field(max_length=MOST_STEPS, fail_fast=True)]
 MOST_SEGMENTS = 20_000  # that the labeled trajectories of one request may bring
 
 
@@ -27,10 +35,10 @@ class LabelItem(Schema):
     """
 
     trajectory: TrajectoryId
-    start: int = Field(ge=0)
-    actions: list[Action] = Field(min_length=1)
-    action_sets: list[list[StrictInt]] | None = None
-    residual: float | None = Field(default=None, ge=0)
+    start: Integer = Field(ge=0)
+    actions: Steps
+    action_sets: ActionSets | None = None
+    residual: Number | None = Field(default=None, ge=0)
 
 
 class LabeledTrajectory(Schema):
@@ -43,11 +51,11 @@ class LabeledTrajectory(Schema):
     """
 
     content: Base64Bytes
-    actions: list[Action] = Field(min_length=1)
-    action_sets: list[list[StrictInt]] | None = None
-    starts: list[int] | None = None
+    actions: Steps
+    action_sets: ActionSets | None = None
+    starts: Starts | None = None
     split: SplitChoice = "auto"
-    rank: int | None = Field(default=None, ge=0)
+    rank: Integer | None = Field(default=None, ge=0)
 
     @model_validator(mode="after")
     def _each_segment_once(self) -> "LabeledTrajectory":
@@ -67,7 +75,7 @@ class LabelsRequest(Schema):
 
     project: UUID
     acquisition: UUID | None = None
-    token: int | None = None
+    token: Integer | None = None
     source: LabelSource = LabelSource()
     items: list[LabelItem] = Field(default=[], max_length=500)
     trajectories: list[LabeledTrajectory] = Field(default=[], max_length=500)

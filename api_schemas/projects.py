@@ -5,7 +5,7 @@ from uuid import UUID
 
 from pydantic import Field, model_validator
 
-from api_schemas.base import Schema, Timestamp
+from api_schemas.base import Integer, Number, Schema, Timestamp
 from api_schemas.environments import Environment, Spaces, bounded_grid, takes_grid
 from api_schemas.strategies import DEFAULT_BATCH_RULE, DEFAULT_STRATEGY, BatchRuleName, StrategyName
 
@@ -23,9 +23,9 @@ class LabelingPolicy(Schema):
 
     strategy: StrategyName = DEFAULT_STRATEGY
     batch_rule: BatchRuleName = DEFAULT_BATCH_RULE
-    round_labels: int = Field(default=100, ge=0)
-    label_budget: int | None = Field(default=None, ge=1)
-    lease_seconds: float = Field(default=3600.0, gt=0, le=30 * 86400)
+    round_labels: Integer = Field(default=100, ge=0)
+    label_budget: Integer | None = Field(default=None, ge=1)
+    lease_seconds: Number = Field(default=3600.0, gt=0, le=30 * 86400)
 
 
 class ProjectCreate(Schema):
@@ -34,10 +34,10 @@ class ProjectCreate(Schema):
     name: str = Field(min_length=1, max_length=80, pattern=r"^[^\s/\x00-\x1f](?:[^/\x00-\x1f]*[^\s/\x00-\x1f])?$")
     environment: Environment
     family: Family | None = Field(default=None, description="default: the one that takes the spaces, if any does")
-    segment_length: int = Field(default=1, ge=1, le=1_000_000)
-    stride: int | None = Field(default=None, ge=1, le=1_000_000, description="default: segment_length")
-    held_out_fraction: float = Field(default=0.1, ge=0, lt=1)
-    seed: int = Field(default=0, ge=0, lt=2**31)
+    segment_length: Integer = Field(default=1, ge=1, le=1_000_000)
+    stride: Integer | None = Field(default=None, ge=1, le=1_000_000, description="default: segment_length")
+    held_out_fraction: Number = Field(default=0.1, ge=0, lt=1)
+    seed: Integer = Field(default=0, ge=0, lt=2**31)
     policy: LabelingPolicy = LabelingPolicy()
 
     @model_validator(mode="after")
@@ -67,9 +67,9 @@ class ProjectPatch(Schema):
 
     strategy: StrategyName | None = None
     batch_rule: BatchRuleName | None = None
-    round_labels: int | None = Field(default=None, ge=0)
-    label_budget: int | None = Field(default=None, ge=1)
-    lease_seconds: float | None = Field(default=None, gt=0, le=30 * 86400)
+    round_labels: Integer | None = Field(default=None, ge=0)
+    label_budget: Integer | None = Field(default=None, ge=1)
+    lease_seconds: Number | None = Field(default=None, gt=0, le=30 * 86400)
 
 
 class Budget(Schema):

@@ -8,7 +8,19 @@ from importlib.metadata import version
 import structlog
 from fastapi import FastAPI
 
-from service.api import acquisitions, jobs, labels, problems, projects, rounds, security, system, trajectories
+from service import traces
+from service.api import (
+    acquisitions,
+    description,
+    jobs,
+    labels,
+    problems,
+    projects,
+    rounds,
+    security,
+    system,
+    trajectories,
+)
 from service.api.dependencies import Services
 from service.carrier import Relay
 from service.clock import utc_now
@@ -33,10 +45,18 @@ def create_app(settings: Settings | None = None, clock: Callable[[], datetime] =
         version=version("asim"),
         summary="Active learning for robot world models: which few segments of your action-free data to label next.",
         lifespan=_lifespan,
+        telemetry={
+            "tracer_provider": traces.provider(settings.traces_url),
+            "tracing": bool(settings.traces_url),
+            "operation_spans": False,
+            "metrics": False,  # /metrics has them
+            "logs": False,  # service.log writes them
+        },
         docs_url=None,  # FastAPI's pages load their scripts from another host
         redoc_url=None,
     )
     app.state.services = open_services(settings, clock)
+    description.install(app)
     problems.install(app)
     security.install(app, app.state.services)
     for module in (projects, trajectories, acquisitions, labels, rounds, jobs, system):

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
 from api_schemas.environments import Spaces, Stream
 from api_schemas.trajectories import SplitChoice, Trajectory, TrajectoryReceipt
-from service import events
-from service.errors import InvalidTrajectory, SplitConflict, UnknownResource
+from service import events, streams
+from service.errors import SplitConflict, UnknownResource
 from service.store import codec
 from service.store.blobs import Blobs
 from service.store.queries import pool as queries
@@ -36,26 +35,12 @@ def store(blobs: Blobs, spaces: Spaces, arrays: Mapping[str, NDArray[Any]], sour
 
     arrays: one a stream, (T + 1, ...), T >= 1.
     """
-    check(spaces, arrays, source)
+    streams.check(spaces, arrays, source)
     data = codec.encode(arrays)
-    streams: dict[str, object] = {name: spec.model_dump(mode="json") for name, spec in spaces.observations.items()}
+    told: dict[str, object] = {name: spec.model_dump(mode="json") for name, spec in spaces.observations.items()}
     transitions = len(next(iter(arrays.values()))) - 1
     sha256 = blobs.put("trajectories", data)
-    return StoredTrajectory(codec.content_id(arrays), sha256, transitions, streams, len(data), source)
-
-
-def check(spaces: Spaces, arrays: Mapping[str, NDArray[Any]], source: str) -> None:
-    """Every stream there with its dtype and shape, equal lengths, two observations at least, finite numbers."""
-    expected, found = sorted(spaces.observations), sorted(arrays)
-    if expected != found:
-        raise InvalidTrajectory(f"{source}: streams", found, f"must be {expected}")
-    for name, stream in spaces.observations.items():
-        _check_stream(arrays[name], stream, f"{source}: {name}")
-    lengths = {name: len(array) for name, array in arrays.items()}
-    if len(set(lengths.values())) > 1:
-        raise InvalidTrajectory(f"{source}: length", lengths, "must be the same for all streams")
-    if min(lengths.values()) < 2:
-        raise InvalidTrajectory(f"{source}: length", min(lengths.values()), "must be at least 2 observations")
+    return StoredTrajectory(codec.content_id(arrays), sha256, transitions, told, len(data), source)
 
 
 def keep(session: Session, stored: Sequence[StoredTrajectory], now: datetime) -> None:
@@ -161,19 +146,6 @@ def _join(
         project.held_out_segments += member.segments
     events.record(session, project.id, "trajectory.added", {"trajectory": stored.id, "split": member.split}, now)
     return member
-
-
-def _check_stream(array: NDArray[Any], stream: Stream, name: str) -> None:
-    if array.dtype != np.dtype(stream.dtype):
-        raise InvalidTrajectory(f"{name}: dtype", array.dtype, f"must be {stream.dtype}")
-    if array.shape[1:] != stream.shape or array.ndim == 0:
-        raise InvalidTrajectory(f"{name}: shape", array.shape, f"must be (T + 1, {', '.join(map(str, stream.shape))})")
-    if stream.high is not None and (array > np.asarray(stream.high)).any():
-        where = np.argwhere(array > np.asarray(stream.high))[0]
-        raise InvalidTrajectory(f"{name}{where.tolist()}", array[tuple(where)], f"must be at most {stream.high}")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        where = np.argwhere(~np.isfinite(array))[0]
-        raise InvalidTrajectory(f"{name}{where.tolist()}", array[tuple(where)], "must be finite")
 
 
 def _trajectory_row(stored: StoredTrajectory, now: datetime) -> TrajectoryRow:

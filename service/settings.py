@@ -41,6 +41,9 @@ class Settings(BaseSettings):
     broker_url: str = ""
     relay: bool = Field(default=True, description="API processes send jobs to workers; false: asim scheduler does")
     celery_prefix: str = "asim"
+    traces_url: str = Field(
+        default="", description="OTLP collector, as http://collector:4318/v1/traces; empty: no traces"
+    )
     job_lease_seconds: float = Field(default=15.0, gt=0)
     job_max_attempts: int = Field(default=3, ge=1)
     checkpoint_seconds: float = Field(default=10.0, gt=0, description="a stage of training is kept this often")
@@ -59,6 +62,9 @@ class Settings(BaseSettings):
     allowed_hosts: tuple[str, ...] = ("127.0.0.1", "localhost", "[::1]")
     max_body_bytes: int = Field(default=256 * 2**20, ge=1)
     max_labels_bytes: int = Field(default=64 * 2**20, ge=1)
+    max_json_bytes: int = Field(default=4 * 2**20, ge=1, description="of every body that brings no data")
+    failed_keys_per_minute: int = Field(default=100, ge=1, description="of one address; raise it behind a proxy")
+    failures_per_key: int = Field(default=10, ge=1, description="a minute, of one key at one address")
     min_free_bytes: int = Field(default=2**30, ge=0, description="of a disk; asim doctor warns below it")
 
     def make_data_folder(self) -> Path:

@@ -20,7 +20,7 @@ from api_schemas.jobs import (
     TrainRound,
     TrainSubgoalGenerator,
 )
-from service import canary, jobs, origin, reaper
+from service import canary, jobs, origin, reaper, traces
 from service.errors import BlobsUnavailable, JobLost
 from service.log import get_logger
 from service.settings import Settings
@@ -68,8 +68,14 @@ def run_job(worker: Worker, job_id: UUID) -> bool:
 def run_claimed(worker: Worker, row: JobRow) -> None:
     """Run a job that this worker has claimed, to one of its ends."""
     job = RunningJob(worker, jobs.lease_of(row))
+    told: dict[str, str | int] = {
+        "asim.job": str(row.id),
+        "asim.attempt": row.attempts,
+        traces.CORRELATION: row.correlation,
+    }
     with (
         origin.bound(worker.owner, row.correlation),
+        traces.span(worker.settings.traces_url, f"job {row.kind}", told),
         structlog.contextvars.bound_contextvars(job=str(row.id), kind=row.kind, attempt=row.attempts),
     ):
         tell = log.debug if row.kind == "canary" else log.info  # of canaries the failures are enough
@@ -134,6 +140,7 @@ def _give_back(job: RunningJob, reason: GaveWay) -> None:
 
 def _fail(job: RunningJob, error: Exception) -> None:
     log.error("job_failed", exc_info=error)
+    traces.failed(error)
     sentence = f"{type(error).__name__}: {error}"
     try:
         with job.worker.database.write() as session:

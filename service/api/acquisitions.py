@@ -11,7 +11,21 @@ from api_schemas.acquisitions import AcquireRequest, Acquisition, AcquisitionPen
 from service import acquisitions, jobs, leases
 from service.api.access import By, CallerDep, by_body, requires
 from service.api.dependencies import Now, ReadSession, Services, ServicesDep, WriteSession
+from service.api.description import refuses
 from service.api.once import Answer, IdempotencyKey, Prefer, answered_once, key_use, wait_seconds
+from service.errors import (
+    AllExplored,
+    BudgetExhausted,
+    IdempotencyKeyReused,
+    InvalidLeaseToken,
+    KeyBusy,
+    LeaseLost,
+    NoModelFamily,
+    NothingToExplore,
+    PoolExhausted,
+    PrivilegedStrategy,
+    UnknownStrategy,
+)
 from service.idempotency import KeyUse
 from service.store.tables import AcquisitionRow, JobRow
 
@@ -24,7 +38,20 @@ POLL_SECONDS = 0.1
     "/acquire",
     status_code=201,
     response_model=Acquisition,
-    responses={202: {"model": AcquisitionPending}},
+    responses={
+        202: {"model": AcquisitionPending, "description": "No ranked queue is ready; poll the job, then ask again"},
+        **refuses(
+            UnknownStrategy,
+            PrivilegedStrategy,
+            PoolExhausted,
+            BudgetExhausted,
+            NothingToExplore,
+            AllExplored,
+            NoModelFamily,
+            IdempotencyKeyReused,
+            KeyBusy,
+        ),
+    },
     dependencies=[requires("acquire", by_body)],
 )
 async def acquire(
@@ -58,13 +85,21 @@ def show_acquisition(acquisition_id: UUID, session: ReadSession, now: Now) -> Ac
     return acquisitions.describe(session, row, now, with_token=False)
 
 
-@router.post("/acquisitions/{acquisition_id}/extend", dependencies=[requires("acquire", by_acquisition)])
+@router.post(
+    "/acquisitions/{acquisition_id}/extend",
+    responses=refuses(InvalidLeaseToken, BudgetExhausted, LeaseLost),
+    dependencies=[requires("acquire", by_acquisition)],
+)
 def extend(acquisition_id: UUID, request: ExtendRequest, session: WriteSession, held: ServicesDep) -> Acquisition:
     row = leases.extend(session, acquisition_id, request.token, request.lease_seconds, held.clock)
     return acquisitions.describe(session, row, held.clock(), with_token=True)
 
 
-@router.post("/acquisitions/{acquisition_id}/release", dependencies=[requires("acquire", by_acquisition)])
+@router.post(
+    "/acquisitions/{acquisition_id}/release",
+    responses=refuses(InvalidLeaseToken, LeaseLost),
+    dependencies=[requires("acquire", by_acquisition)],
+)
 def release(acquisition_id: UUID, request: ReleaseRequest, session: WriteSession, held: ServicesDep) -> Acquisition:
     row = leases.release(session, acquisition_id, request.token, held.clock)
     return acquisitions.describe(session, row, held.clock(), with_token=False)

@@ -8,20 +8,17 @@ from math import ceil
 from time import time
 from uuid import UUID
 
-from limits import RateLimitItem, RateLimitItemPerMinute
+from limits import RateLimitItem
 from limits.storage import MemoryStorage
 from limits.strategies import MovingWindowRateLimiter
 
 from service.errors import TooManyFailedKeys
 
-PER_KEY = RateLimitItemPerMinute(10)  # one forgotten script does not lock out its machine
-PER_ADDRESS = RateLimitItemPerMinute(100)
-
 
 class FailedKeys:
     """Failures of the last minute, by address and by the key that a secret claims to be of."""
 
-    def __init__(self, per_key: RateLimitItem = PER_KEY, per_address: RateLimitItem = PER_ADDRESS) -> None:
+    def __init__(self, per_address: RateLimitItem, per_key: RateLimitItem) -> None:
         self._per_key, self._per_address = per_key, per_address
         self._limiter = MovingWindowRateLimiter(MemoryStorage())
 

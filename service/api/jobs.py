@@ -11,7 +11,8 @@ from api_schemas.jobs import Job
 from service import cancellation, events, jobs, projects
 from service.api.access import By, CallerDep, by_query, narrowed, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, WriteSession
-from service.errors import UnknownResource
+from service.api.description import refuses
+from service.errors import JobFinished, UnknownResource
 from service.store.queries.events import ORDER, settled
 from service.store.queries.listing import page
 from service.store.tables import EventRow, JobRow
@@ -40,7 +41,7 @@ def show_job(job_id: UUID, session: ReadSession) -> Job:
     return jobs.describe(jobs.find(session, job_id))
 
 
-@router.delete("/jobs/{job_id}", dependencies=[requires("admin", by_job)])
+@router.delete("/jobs/{job_id}", responses=refuses(JobFinished), dependencies=[requires("admin", by_job)])
 def cancel_job(job_id: UUID, session: WriteSession, now: Now) -> Job:
     return jobs.describe(cancellation.cancel(session, job_id, now))
 

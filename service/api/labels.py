@@ -1,5 +1,6 @@
 """/labels."""
 
+import io
 from datetime import datetime
 from uuid import UUID
 
@@ -8,22 +9,53 @@ from fastapi import APIRouter, Request, Response
 from api_schemas.base import Page
 from api_schemas.environments import Spaces
 from api_schemas.labels import MOST_SEGMENTS, Label, LabelsAccepted, LabelsRequest
-from service import labels, pool, projects
+from service import labels, pool, projects, streams
 from service.actions import check_actions
 from service.api.access import CallerDep, by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep
+from service.api.description import refuses
 from service.api.once import Answer, IdempotencyKey, answered_once, kept_answer, key_use
-from service.errors import InvalidField
+from service.errors import (
+    BlobsUnavailable,
+    ForeignFile,
+    IdempotencyKeyReused,
+    InvalidField,
+    InvalidLabel,
+    InvalidLeaseToken,
+    InvalidTrajectory,
+    KeyBusy,
+    LabelConflict,
+    LeaseLost,
+    SegmentLeased,
+    SplitConflict,
+)
 from service.idempotency import KeyUse
 from service.labels import LabeledUpload
-from service.store import npz
 from service.store.queries.listing import page
 from service.store.tables import LabelRow, ProjectRow
 
 router = APIRouter(prefix="/labels", tags=["labels"])
 
 
-@router.post("", status_code=201, response_model=LabelsAccepted, dependencies=[requires("label", by_body)])
+@router.post(
+    "",
+    status_code=201,
+    response_model=LabelsAccepted,
+    responses=refuses(
+        ForeignFile,
+        InvalidLeaseToken,
+        LabelConflict,
+        SplitConflict,
+        LeaseLost,
+        InvalidLabel,
+        InvalidTrajectory,
+        IdempotencyKeyReused,
+        SegmentLeased,
+        BlobsUnavailable,
+        KeyBusy,
+    ),
+    dependencies=[requires("label", by_body)],
+)
 def add_labels(
     request: LabelsRequest,
     held: ServicesDep,
@@ -82,20 +114,21 @@ def _store_trajectories(held: Services, request: LabelsRequest) -> list[LabeledU
         project = projects.find(session, request.project)
         spaces: Spaces = projects.spaces_of(project)
     _check_size(project, request)
-    uploads = []
-    for position, trajectory in enumerate(request.trajectories):
-        name = f"trajectories[{position}]"
-        arrays = npz.parse(trajectory.content, f"{name}.content", held.settings.max_body_bytes)
+    names = [f"trajectories[{position}]" for position in range(len(request.trajectories))]
+    for name, trajectory in zip(names, request.trajectories, strict=True):
         check_actions(spaces, trajectory.actions, trajectory.action_sets, name)
-        stored = pool.store(held.blobs, spaces, arrays, name)
-        uploads.append(
-            LabeledUpload(
-                stored,
-                trajectory.actions,
-                trajectory.action_sets,
-                trajectory.starts,
-                trajectory.split,
-                rank=trajectory.rank,
-            )
+    files = [
+        (f"{name}.content", io.BytesIO(one.content)) for name, one in zip(names, request.trajectories, strict=True)
+    ]
+    arrays = streams.read(spaces, files, held.settings.max_body_bytes)
+    return [
+        LabeledUpload(
+            pool.store(held.blobs, spaces, observed, name),
+            trajectory.actions,
+            trajectory.action_sets,
+            trajectory.starts,
+            trajectory.split,
+            rank=trajectory.rank,
         )
-    return uploads
+        for name, observed, trajectory in zip(names, arrays, request.trajectories, strict=True)
+    ]

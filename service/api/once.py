@@ -22,8 +22,9 @@ LONGEST_WAIT = 30.0  # seconds that an answer is held back at most
 IdempotencyKey = Annotated[
     str | None,
     Header(
+        json_schema_extra={"minLength": 1, "maxLength": 200, "pattern": "^[ -~]*$"},
         description="any text of 1 to 200 printable characters; the same request under the same key is done once and "
-        "answered alike, for a week by default (ASIM_IDEMPOTENCY_HOURS)"
+        "answered alike, for a week by default (ASIM_IDEMPOTENCY_HOURS)",
     ),
 ]
 Prefer = Annotated[str | None, Header(description="`wait=20` holds a 202 for up to 20 seconds, 30 at most")]

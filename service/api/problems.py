@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from http import HTTPStatus
+from reprlib import Repr
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -11,11 +12,16 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
 from api_schemas.errors import PROBLEM_JSON, InvalidParam, Problem
+from service.api.description import methods
 from service.api.headers import CORRELATION, HEADERS
-from service.errors import RETRY_SOON, BodyTooLarge, ServiceError
+from service.errors import LONGEST, RETRY_SOON, BodyTooLarge, ServiceError
 from service.log import get_logger
 
 log = get_logger("api")
+MOST_SHOWN = 20  # wrong fields of one request
+BRIEFLY = Repr()
+BRIEFLY.maxlevel, BRIEFLY.maxdict, BRIEFLY.maxlist, BRIEFLY.maxtuple = 4, 20, 20, 20
+BRIEFLY.maxstring = BRIEFLY.maxother = LONGEST
 # A database that is down, full or slow; "internal" is what PostgreSQL calls that it ended an idle transaction.
 OUTAGES = (OperationalError, InterfaceError, InternalError, PoolTimeout)
 
@@ -55,9 +61,9 @@ def _malformed(request: Request, error: Exception) -> JSONResponse:
         InvalidParam(
             name=_printable(".".join(str(part) for part in problem["loc"] if part != "body")) or "body",
             reason=str(problem["msg"]).removeprefix("Value error, "),
-            value=_printable(str(problem.get("input"))),
+            value=_printable(_shown(problem.get("input"))),
         )
-        for problem in error.errors()
+        for problem in error.errors()[:MOST_SHOWN]
     ]
     detail = "; ".join(f"{param.name}: {param.reason}, got {param.value}" for param in params)
     return answer(_problem("malformed-request", 422, "The request is malformed", detail, request, params))
@@ -68,9 +74,14 @@ def _http_error(request: Request, error: Exception) -> JSONResponse:
         raise error
     if error.status_code == HTTPStatus.REQUEST_ENTITY_TOO_LARGE:  # a body that did not say its length beforehand
         return refusal(request, BodyTooLarge(str(error.detail)))
+    headers = dict(error.headers or {})
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:  # Starlette names the methods of one of the path's routes
+        headers["Allow"] = ", ".join(methods(request.app, request.url.path)) or headers.get("Allow", "")
+    if isinstance(error.__cause__, RecursionError):
+        return answer(_problem("bad-request", 400, "Bad Request", "body: is nested too deeply", request))
     title = HTTPStatus(error.status_code).phrase
     problem = _problem(title.lower().replace(" ", "-"), error.status_code, title, str(error.detail), request)
-    return answer(problem, dict(error.headers) if error.headers else None)
+    return answer(problem, headers)
 
 
 def _unstorable(request: Request, error: Exception) -> JSONResponse:
@@ -95,9 +106,14 @@ def _unexpected(request: Request, error: Exception) -> JSONResponse:
     return answer(problem, HEADERS | {CORRELATION: correlation})
 
 
+def _shown(value: object) -> str:
+    """The beginning of it; the whole of a large body as text would be a second body."""
+    return value[:LONGEST] if isinstance(value, str) else BRIEFLY.repr(value)
+
+
 def _printable(text: str) -> str:
-    """At most 200 characters that UTF-8 can carry: JSON may hold halves of a surrogate pair."""
-    return text[:200].encode("utf-8", "backslashreplace").decode()
+    """At most LONGEST characters that UTF-8 can carry: JSON may hold halves of a surrogate pair."""
+    return text[:LONGEST].encode("utf-8", "backslashreplace").decode()
 
 
 def _problem(

@@ -9,13 +9,15 @@ from api_schemas.projects import Project, ProjectCreate, ProjectPatch
 from service import projects
 from service.api.access import CallerDep, by_path, narrowed, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, WriteSession
+from service.api.description import refuses
+from service.errors import NameTaken, PrivilegedStrategy
 from service.store.queries.listing import page
 from service.store.tables import ProjectRow
 
 router = APIRouter(prefix="/projects", tags=["projects"])
 
 
-@router.post("", status_code=201, dependencies=[requires("admin")])
+@router.post("", status_code=201, responses=refuses(NameTaken, PrivilegedStrategy), dependencies=[requires("admin")])
 def create_project(request: ProjectCreate, session: WriteSession, now: Now, response: Response) -> Project:
     row = projects.create(session, request, now)
     response.headers["Location"] = f"/projects/{row.id}"
@@ -36,6 +38,6 @@ def show_project(project_id: UUID, session: ReadSession, now: Now) -> Project:
     return projects.describe(session, projects.find(session, project_id), now)
 
 
-@router.patch("/{project_id}", dependencies=[requires("admin", by_path)])
+@router.patch("/{project_id}", responses=refuses(PrivilegedStrategy), dependencies=[requires("admin", by_path)])
 def change_project(project_id: UUID, patch: ProjectPatch, session: WriteSession, now: Now) -> Project:
     return projects.describe(session, projects.change(session, project_id, patch, now), now)

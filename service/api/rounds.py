@@ -12,6 +12,8 @@ from api_schemas.rounds import ModelErrorCurve, Round, RoundCreate
 from service import projects, registry, rounds
 from service.api.access import By, by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
+from service.api.description import refuses
+from service.errors import BlobsUnavailable, NoModelFamily, NothingToLearn
 from service.store.queries.listing import page
 from service.store.tables import ModelVersionRow, RoundRow
 
@@ -20,7 +22,12 @@ reader = requires("read", by_query)
 by_round, by_model = By(RoundRow, "round"), By(ModelVersionRow, "model")
 
 
-@router.post("/rounds", status_code=202, dependencies=[requires("admin", by_body)])
+@router.post(
+    "/rounds",
+    status_code=202,
+    responses=refuses(NoModelFamily, NothingToLearn),
+    dependencies=[requires("admin", by_body)],
+)
 def start_round(request: RoundCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Round:
     project = projects.find(session, request.project, lock=True)
     row = rounds.request(session, project, now, held.settings.job_max_attempts)
@@ -42,7 +49,12 @@ def show_round(round_id: UUID, session: ReadSession) -> Round:
     return rounds.describe(session, rounds.find(session, round_id))
 
 
-@router.get("/model-error", response_model=ModelErrorCurve, dependencies=[reader])
+@router.get(
+    "/model-error",
+    response_model=ModelErrorCurve,
+    responses={304: {"description": "The curve is the one that If-None-Match names"}},
+    dependencies=[reader],
+)
 def model_error(project: UUID, session: ReadSession, if_none_match: Annotated[str | None, Header()] = None) -> Response:
     body = rounds.curve(session, projects.find(session, project)).model_dump_json().encode()
     etag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
@@ -69,7 +81,15 @@ def show_model(model_id: UUID, session: ReadSession) -> ModelVersion:
     return registry.describe(registry.find(session, model_id))
 
 
-@router.get("/models/{model_id}/weights", response_class=Response, dependencies=[requires("read", by_model)])
+@router.get(
+    "/models/{model_id}/weights",
+    response_class=Response,
+    responses={
+        200: {"description": "A safetensors file", "content": {"application/octet-stream": {}}},
+        **refuses(BlobsUnavailable),
+    },
+    dependencies=[requires("read", by_model)],
+)
 def model_weights(model_id: UUID, held: ServicesDep) -> Response:
     with held.database.read() as session:
         row = registry.find(session, model_id)

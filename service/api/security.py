@@ -12,9 +12,10 @@ from uuid import uuid4
 
 from fastapi import FastAPI, HTTPException, Request
 from fastapi.concurrency import run_in_threadpool
+from limits import RateLimitItemPerMinute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service import keys, origin
+from service import keys, origin, traces
 from service.api import problems
 from service.api.access import NO_KEY, ON_THIS_MACHINE, Caller
 from service.api.attempts import FailedKeys
@@ -39,7 +40,11 @@ class Guard:
 
     def __init__(self, app: ASGIApp, services: Services) -> None:
         self._app, self._services = app, services
-        self._failed = FailedKeys()
+        asked = services.settings
+        self._failed = FailedKeys(
+            per_address=RateLimitItemPerMinute(asked.failed_keys_per_minute),
+            per_key=RateLimitItemPerMinute(asked.failures_per_key),  # a forgotten script does not lock out its machine
+        )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -47,6 +52,7 @@ class Guard:
             return
         request = Request(scope)
         correlation = request.state.correlation = _correlation(request)
+        traces.note(traces.CORRELATION, correlation)
         with origin.bound(actor="", correlation=correlation):
             named = _with_headers(send, HEADERS | {CORRELATION: correlation})
             await self._guarded(request, receive, self._timed(request, named))
@@ -127,9 +133,11 @@ def _with_headers(send: Send, headers: dict[str, str]) -> Send:
 
 
 def _largest_body(request: Request, settings: Settings) -> int:
-    if request.method == "POST" and request.url.path == "/labels":
-        return min(settings.max_labels_bytes, settings.max_body_bytes)
-    return settings.max_body_bytes
+    """Parsed JSON takes twenty times its bytes and more, so only bodies that bring data may be long."""
+    if request.method == "POST" and request.url.path == "/trajectories":
+        return settings.max_body_bytes
+    own = settings.max_labels_bytes if request.url.path == "/labels" else settings.max_json_bytes
+    return min(own, settings.max_body_bytes)
 
 
 def _check_host(request: Request, settings: Settings) -> None:

@@ -75,7 +75,12 @@ def ready(held: ServicesDep, now: Now) -> JSONResponse:
     return JSONResponse(body.model_dump(), 200 if healthy else 503)
 
 
-@router.get("/metrics", response_class=Response, dependencies=[requires("read")])
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"description": "Prometheus metrics", "content": {"text/plain": {}}}},
+    dependencies=[requires("read")],
+)
 def metrics(session: ReadSession, now: Now, held: ServicesDep) -> Response:
     told = generate_latest(gauges(session, now)) + generate_latest(held.answered.registry)
     return Response(told, media_type=CONTENT_TYPE_LATEST)

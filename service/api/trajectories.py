@@ -1,18 +1,28 @@
 """/trajectories and /collections."""
 
-from typing import Annotated
+from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Query, Response, UploadFile
+from fastapi import APIRouter, File, Query, Response, UploadFile
 
 from api_schemas.base import Page
 from api_schemas.collections import CollectionCreate
 from api_schemas.jobs import Job
 from api_schemas.trajectories import SplitChoice, TrajectoriesAdded, Trajectory
-from service import collections, jobs, pool, projects
+from service import collections, jobs, pool, projects, streams
 from service.api.access import by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
-from service.errors import InvalidField, NoProvenance
+from service.api.description import refuses
+from service.errors import (
+    BlobsUnavailable,
+    ForeignFile,
+    InvalidField,
+    InvalidTrajectory,
+    NoProvenance,
+    NoSimulator,
+    SplitConflict,
+    UnknownBehavior,
+)
 from service.store import codec, npz
 from service.store.queries import labels as label_queries
 from service.store.queries import pool as pool_queries
@@ -23,19 +33,28 @@ router = APIRouter(tags=["trajectories"])
 reader, labeler = requires("read", by_query), requires("label", by_query)
 Start = Annotated[int, Query(ge=0, description="first observation")]
 Length = Annotated[int | None, Query(ge=0, description="transitions after it; default to the end")]
+Files = Annotated[list[UploadFile], File(min_length=1, max_length=1000, description="npz files, one a trajectory")]
 NPZ = "application/octet-stream"
+NPZ_FILE: dict[int | str, dict[str, Any]] = {
+    200: {"description": "An npz file, one array a stream, time first", "content": {NPZ: {}}}
+}
 
 
-@router.post("/trajectories", status_code=201, dependencies=[labeler])
+@router.post(
+    "/trajectories",
+    status_code=201,
+    responses=refuses(ForeignFile, InvalidTrajectory, SplitConflict, BlobsUnavailable),
+    dependencies=[labeler],
+)
 def add_trajectories(
-    project: UUID, files: list[UploadFile], held: ServicesDep, now: Now, split: SplitChoice = "auto"
+    project: UUID, files: Files, held: ServicesDep, now: Now, split: SplitChoice = "auto"
 ) -> TrajectoriesAdded:
     with held.database.read() as session:
         spaces = projects.spaces_of(projects.find(session, project))
     # Blobs first: they are named by content, so a crash before the rows leaves nothing wrong behind.
-    limit = held.settings.max_body_bytes
-    parsed = [(file.filename or "file", npz.parse(file.file.read(), file.filename or "file", limit)) for file in files]
-    stored = [pool.store(held.blobs, spaces, arrays, name) for name, arrays in parsed]
+    named = [(file.filename or "file", file.file) for file in files]
+    arrays = streams.read(spaces, named, held.settings.max_body_bytes)
+    stored = [pool.store(held.blobs, spaces, each, name) for (name, _), each in zip(named, arrays, strict=True)]
     with held.database.write() as session:
         pool.keep(session, stored, now)
         row = projects.find(session, project, lock=True)
@@ -64,7 +83,12 @@ def show_trajectory(trajectory_id: str, project: UUID, session: ReadSession) -> 
     return pool.describe(member, content, labeled.get(trajectory_id, 0))
 
 
-@router.get("/trajectories/{trajectory_id}/content", dependencies=[reader], response_class=Response)
+@router.get(
+    "/trajectories/{trajectory_id}/content",
+    dependencies=[reader],
+    response_class=Response,
+    responses=refuses(BlobsUnavailable) | NPZ_FILE,
+)
 def trajectory_content(
     trajectory_id: str, project: UUID, held: ServicesDep, start: Start = 0, length: Length = None
 ) -> Response:
@@ -76,7 +100,12 @@ def trajectory_content(
     return Response(npz.dump(arrays), media_type=NPZ)
 
 
-@router.get("/trajectories/{trajectory_id}/provenance", dependencies=[labeler], response_class=Response)
+@router.get(
+    "/trajectories/{trajectory_id}/provenance",
+    dependencies=[labeler],
+    response_class=Response,
+    responses=refuses(NoProvenance, BlobsUnavailable) | NPZ_FILE,
+)
 def trajectory_provenance(
     trajectory_id: str, project: UUID, held: ServicesDep, start: Start = 0, length: Length = None
 ) -> Response:
@@ -90,7 +119,12 @@ def trajectory_provenance(
     return Response(npz.dump(states, extra["metadata"]), media_type=NPZ)
 
 
-@router.post("/collections", status_code=202, dependencies=[requires("admin", by_body)])
+@router.post(
+    "/collections",
+    status_code=202,
+    responses=refuses(NoSimulator, UnknownBehavior),
+    dependencies=[requires("admin", by_body)],
+)
 def collect(request: CollectionCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Job:
     row = collections.request(session, request, now, held.settings.job_max_attempts)
     response.headers.update({"Location": f"/jobs/{row.id}", "Retry-After": "1"})

@@ -3,8 +3,10 @@
 import io
 import math
 import zipfile
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,11 @@ from service.errors import ForeignFile
 
 npy: Any = np.lib.format  # it has no types
 METADATA = "__metadata__"
+ENTRY = b"PK\x01\x02"  # opens each entry of an archive's directory
+MOST_MEMBERS = 256
+LONGEST_HEADER = 10_000  # bytes; numpy itself reads no longer one
+HEADERS = {(1, 0): (2, npy.read_array_header_1_0), (2, 0): (4, npy.read_array_header_2_0)}  # width of the length
+BLOCK = 2**20
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy writes; zipfile bounds the output of no other
 
 
@@ -29,36 +36,96 @@ def dump(arrays: Mapping[str, NDArray[Any]], metadata: str | None = None) -> byt
 
 def parse(data: bytes, source: str, max_bytes: int) -> dict[str, NDArray[Any]]:
     """Npz bytes to arrays, read-only. Raises ForeignFile for anything that is not a whole npz of plain arrays."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            _check_size(archive, source, max_bytes)
-            named = {info.filename.removesuffix(".npy"): _array(archive, info) for info in archive.infolist()}
-    except ForeignFile:
-        raise
-    except Exception as error:  # on bytes that are not theirs the parsers of zip and npy raise a dozen kinds of errors
-        raise ForeignFile(source, f"is not a whole npz file of plain arrays ({error})") from error
-    return {name: array for name, array in named.items() if name != METADATA}
+    return NpzFile(io.BytesIO(data), source, max_bytes).arrays()
 
 
-def _check_size(archive: zipfile.ZipFile, source: str, max_bytes: int) -> None:
-    size = sum(info.file_size for info in archive.infolist())
-    if size > max_bytes:
-        raise ForeignFile(source, f"unpacks to {size} bytes, {max_bytes} are allowed")
+@dataclass(frozen=True)
+class Form:
+    """What the header of a member promises. offset: of the data, behind the header."""
+
+    member: zipfile.ZipInfo
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fortran: bool
+    offset: int
 
 
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """One member. Its size is checked before numpy believes what the header promises. Raises ValueError."""
+class NpzFile:
+    """A file whose headers are read and held against its sizes; data is unpacked on demand, once it is known to fit.
+
+    forms: by stream. bytes: that the arrays take unpacked.
+    """
+
+    def __init__(self, file: BinaryIO, source: str, max_bytes: int) -> None:
+        """Raises ForeignFile for what is no npz of plain arrays, or would unpack to more than `max_bytes`."""
+        self._file, self.source = file, source
+        with self._reading():
+            _check_members(file)
+            with zipfile.ZipFile(file) as archive:
+                members = archive.infolist()
+                self.bytes = sum(info.file_size for info in members)
+                if self.bytes > max_bytes:
+                    raise ForeignFile(source, f"unpacks to {self.bytes} bytes, {max_bytes} are allowed")
+                named = {info.filename.removesuffix(".npy"): _form(archive, info) for info in members}
+        self.forms = {name: form for name, form in named.items() if name != METADATA}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All streams, read-only. Raises ForeignFile."""
+        with self._reading(), zipfile.ZipFile(self._file) as archive:
+            return {name: _array(archive, form) for name, form in self.forms.items()}
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except ForeignFile:
+            raise
+        except Exception as error:  # on bytes that are not theirs the parsers of zip and npy raise a dozen kinds
+            raise ForeignFile(self.source, f"is not a whole npz file of plain arrays ({error})") from error
+
+
+def _check_members(file: BinaryIO) -> None:
+    """Counts entries before zipfile makes an object of each. Raises ValueError."""
+    found, tail = 0, b""
+    file.seek(0)
+    while block := file.read(BLOCK):
+        found += (tail + block).count(ENTRY)
+        tail = block[1 - len(ENTRY) :]
+    if found > MOST_MEMBERS:
+        raise ValueError(f"{found} members, {MOST_MEMBERS} are allowed")
+
+
+def _form(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Form:
+    """The header of one member, held against its size before anybody believes it. Raises ValueError."""
     if info.compress_type not in COMPRESSIONS:
         raise ValueError(f"{info.filename} has compression {info.compress_type}")
     with archive.open(info) as member:
-        content = member.read(info.file_size)  # bounded: a plain read() unpacks all that a lying member holds
-    stream = io.BytesIO(content)
-    version = npy.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"{info.filename} has npy version {version}")
-    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, fortran, dtype = read_header(stream)
-    promised, held = math.prod(shape) * dtype.itemsize, len(content) - stream.tell()
+        version = npy.read_magic(member)
+        if version not in HEADERS:
+            raise ValueError(f"{info.filename} has npy version {version}")
+        width, read_header = HEADERS[version]
+        told = member.read(width)
+        length = int.from_bytes(told, "little")
+        if length > LONGEST_HEADER:
+            raise ValueError(f"{info.filename} has a header of {length} bytes, {LONGEST_HEADER} are allowed")
+        shape, fortran, dtype = read_header(io.BytesIO(told + member.read(length)))
+    offset = npy.MAGIC_LEN + width + length
+    promised, held = math.prod(shape) * dtype.itemsize, info.file_size - offset
     if dtype.hasobject or promised != held:
         raise ValueError(f"{info.filename} promises {promised} bytes of {dtype} and holds {held}")
-    return np.ndarray(shape, dtype, content, stream.tell(), order="F" if fortran else "C")
+    return Form(info, shape, dtype, fortran, offset)
+
+
+def _array(archive: zipfile.ZipFile, form: Form) -> NDArray[Any]:
+    """The data of one member. Raises ValueError."""
+    size, held = form.member.file_size, 0
+    content = bytearray(size)  # filled block by block: zlib would hold the whole twice
+    with archive.open(form.member) as member:
+        while block := member.read(min(BLOCK, size - held)):  # bounded: a lying member may hold more than its size
+            content[held : held + len(block)] = block
+            held += len(block)
+    if held != size:
+        raise ValueError(f"{form.member.filename} promises {size} bytes and holds {held}")
+    array: NDArray[Any] = np.ndarray(form.shape, form.dtype, content, form.offset, order="F" if form.fortran else "C")
+    array.flags.writeable = False
+    return array

@@ -12,6 +12,7 @@ import pytest
 from sqlalchemy import make_url
 
 from asim.client import Client
+from service.store.provenance import ProvenanceBlobs
 from tests.compose.compose_file import FILE, OURS, ROOT, Json, Machine, compose, make_secrets, service
 from tests.compose.story import check_same_story, scraped
 from tests.loop.first_round import START_SECONDS, collected, first_round
@@ -56,6 +57,36 @@ def test_training_and_scoring_have_no_way_to_provenance() -> None:
         assert not any("provenance" in volume for volume in service(name).get("volumes", []))
     for name in ("service", "labeler"):
         assert "provenance:/provenance" in service(name)["volumes"]
+
+
+TRY = """
+import sys
+from service.errors import MissingBlob
+from service.settings import Settings
+from service.store.provenance import ProvenanceBlobs, open_provenance
+settings, sha256 = Settings(), sys.argv[1]
+store = open_provenance(settings)
+print("store:", "none" if store is None else store.get("provenance", sha256).decode())
+try:
+    print("blobs:", ProvenanceBlobs(settings.resolved_blobs_url()).get("provenance", sha256).decode())
+except MissingBlob:
+    print("blobs: none")
+print("named:", sorted(value for value in map(str, vars(settings).values()) if "provenance" in value))
+"""
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_a_process_with_a_services_settings_tries_to_read_provenance(machine: Machine, name: str) -> None:
+    """Those that train and score cannot, by the store, by the other store, or by a path that their settings know."""
+    kept = ProvenanceBlobs(str(machine.path("/provenance")))
+    sha256 = kept.put("provenance", b"where the agent was")
+    own = environment(**machine.environment(name))
+    argv = [sys.executable, "-c", TRY, sha256]
+    told = subprocess.run(argv, env=own, capture_output=True, text=True, check=True).stdout.splitlines()
+    if name in ("service", "labeler"):
+        assert told == ["store: where the agent was", "blobs: none", f"named: ['{machine.path('/provenance')}']"]
+    else:
+        assert told == ["store: none", "blobs: none", "named: []"]
 
 
 def test_secrets_fit_together_and_are_made_once(tmp_path: Path) -> None:

@@ -1,9 +1,10 @@
 """A service under test: the app, a worker in the same process, a clock that both read; rooms and robots to feed it."""
 
 import io
+import re
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -142,7 +143,7 @@ class Served:
 
     def another_client(self) -> TestClient:
         """A client for a thread of its own."""
-        return TestClient(self.app, base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
+        return client_of(self.app)
 
     def events(self, project: str) -> list[Json]:
         """All events of a project; on PostgreSQL the last are shown once no older transaction is open on the server."""
@@ -168,9 +169,35 @@ def serve(settings: Settings, clock: Clock | None = None) -> Served:
     """The service on these settings."""
     clock = clock or Clock()
     app = create_app(settings, clock)
-    client, opened = TestClient(app, base_url="http://127.0.0.1", client=("127.0.0.1", 50000)), ExitStack()
+    client, opened = client_of(app), ExitStack()
     client.portal = opened.enter_context(start_blocking_portal())  # one event loop, not a new one a request
     return Served(settings, clock, app, client, opened)
+
+
+def client_of(app: FastAPI) -> TestClient:
+    """A client on this machine that takes no answer which the service's own description does not name."""
+    client = TestClient(app, base_url="http://127.0.0.1", client=("127.0.0.1", 50000))
+    client.event_hooks = {"response": [documented(app)]}
+    return client
+
+
+def documented(app: FastAPI) -> Callable[[Any], None]:
+    """Fails on an answer to one of the described endpoints whose status is not described."""
+    operations = [
+        (method.upper(), re.compile(re.sub(r"\{[^}]+\}", "[^/]+", path) + "$"), operation["responses"])
+        for path, methods in app.openapi()["paths"].items()
+        for method, operation in methods.items()
+    ]
+
+    def check(answer: Any) -> None:
+        method, path, status = answer.request.method, answer.request.url.path, str(answer.status_code)
+        for known, pattern, answers in operations:
+            if known == method and pattern.match(path):
+                assert status in answers or status == "500", (
+                    f"{method} {path} answered {status}, described are {sorted(answers)}"
+                )
+
+    return check
 
 
 def room(seed: int, transitions: int = 5, size: int = 6) -> Arrays:

@@ -154,7 +154,7 @@ def test_a_key_that_fails_again_and_again_is_not_looked_up_any_more(start: Serve
 
 
 def test_failures_are_forgotten_after_their_time() -> None:
-    failed = FailedKeys(RateLimitItemPerSecond(2), RateLimitItemPerSecond(5))
+    failed = FailedKeys(per_key=RateLimitItemPerSecond(2), per_address=RateLimitItemPerSecond(5))
     for _ in range(2):
         failed.check("192.0.2.7", None)
         failed.count("192.0.2.7", None)
