@@ -24,7 +24,7 @@ def served(folder: Path, runners: int = 1, host: str = "127.0.0.1") -> Iterator[
     argv = [sys.executable, "-m", "asim", "serve", *(str(word) for option in options.items() for word in option)]
     log = folder / "serve.log"
     with log.open("w") as output:
-        process = subprocess.Popen(argv, stdout=output, stderr=subprocess.STDOUT, process_group=0)  # noqa: S603
+        process = subprocess.Popen(argv, stdout=output, stderr=subprocess.STDOUT, process_group=0)  # noqa: S603  (our own program)
     try:
         yield _await_url(process, folder, log)
     except AsimError as error:

@@ -41,7 +41,7 @@ class Supervised:
 
     def _start(self, now: float) -> None:
         # A process group of its own: Ctrl-C in the terminal reaches the supervisor alone, which then ends this one.
-        self.process = subprocess.Popen(self.argv, env=self.env, stdin=subprocess.DEVNULL, process_group=0)  # noqa: S603
+        self.process = subprocess.Popen(self.argv, env=self.env, stdin=subprocess.DEVNULL, process_group=0)  # noqa: S603  (our own)
         self.started = now
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.figures import Figure
 
-LINES: pytest.StashKey[list[tuple[str, str]]] = pytest.StashKey()  # (test, line), of the whole run
+LINE = "figure"  # among the properties that a test's report carries, also from one process to another
 MISSED: pytest.StashKey[list[str]] = pytest.StashKey()  # lines of one test
 
 
@@ -22,7 +22,6 @@ class Figures:
 
     def __init__(self, item: pytest.Item) -> None:
         self._item = item
-        self._lines = item.config.stash.setdefault(LINES, [])
         self._missed = item.stash.setdefault(MISSED, [])
 
     def add(
@@ -46,7 +45,7 @@ class Figures:
 
     def note(self, line: str) -> None:
         """Record a line that is no figure, such as the seed."""
-        self._lines.append((self._item.nodeid, line))
+        self._item.user_properties.append((LINE, line))
 
 
 @pytest.fixture
@@ -64,12 +63,14 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
         pytest.fail("\n".join(missed), pytrace=False)
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """All figures, by test."""
-    lines = config.stash.get(LINES, [])
-    if lines:
+    ended = [*terminalreporter.getreports("passed"), *terminalreporter.getreports("failed")]
+    told = {report.nodeid: [line for name, line in report.user_properties if name == LINE] for report in ended}
+    if any(told.values()):
         terminalreporter.section("figures")
-    for test in dict.fromkeys(test for test, _ in lines):
-        terminalreporter.line(test)
-        for line in (line for of, line in lines if of == test):
+    for test, lines in told.items():
+        if lines:
+            terminalreporter.line(test)
+        for line in lines:
             terminalreporter.line(f"    {line}")

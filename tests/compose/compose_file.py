@@ -69,7 +69,7 @@ class Machine:
 
     def entered(self, command: list[str]) -> list[str]:
         """A command inside the image."""
-        here = {"0.0.0.0": "127.0.0.1", "8000": str(self.port), "http://127.0.0.1:8000": self.url}  # noqa: S104
+        here = {"0.0.0.0": "127.0.0.1", "8000": str(self.port), "http://127.0.0.1:8000": self.url}
         return [sys.executable, "-m", "asim", *(here.get(word, word) for word in command)]
 
     def environment(self, name: str) -> dict[str, str]:

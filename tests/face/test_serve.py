@@ -66,7 +66,7 @@ def test_a_taken_port_is_refused_before_anything_starts(url: str, tmp_path: Path
     assert not (tmp_path / "asim.db").exists()
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.7", "::", "example.org"])  # noqa: S104
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.7", "::", "example.org"])
 def test_a_host_that_others_reach_is_refused(host: str, tmp_path: Path) -> None:
     assert f"host {host!r} is not a loopback address" in refusal("serve", "--data", str(tmp_path), "--host", host)
     assert list(tmp_path.iterdir()) == []

@@ -23,6 +23,7 @@ from tests.service.kit import ROBOT, Json, serve
 __all__ = ["postgres_server", "postgres_url", "redis_server", "redis_space"]
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parents[1]
+KEPT = "use_after_free"  # nothing is gone after its DELETE: a job is listed as cancelled, and no key can be asked for
 
 
 @dataclass(frozen=True)
@@ -91,8 +92,9 @@ def schemathesis(exposed: Exposed, who: str, *options: str) -> int:
     report, things = exposed.folder / "report.json", exposed.folder / "things.json"
     things.write_text(json.dumps(exposed.things))
     argv = [sys.executable, "-m", "schemathesis.cli", "--config-file", str(FOLDER / "schemathesis.toml")]
-    argv += ["run", f"{exposed.url}/openapi.json", "--checks", "all", "--request-timeout", "20", *options]
-    argv += ["--report", "json", "--report-json-path", str(report), "--continue-on-failure", "--warnings", "off"]
+    argv += ["run", f"{exposed.url}/openapi.json", "--checks", "all", "--exclude-checks", KEPT, *options]
+    argv += ["--report", "json", "--report-json-path", str(report)]
+    argv += ["--continue-on-failure", "--warnings", "off", "--request-timeout", "20"]
     for name, value in exposed.keys[who].items():
         argv += ["--header", f"{name}: {value}"]
     own = {"SCHEMATHESIS_HOOKS": "tests.hostile.hooks", "ASIM_THINGS": str(things), "PYTHONPATH": str(ROOT)}

@@ -1,6 +1,8 @@
 """How much one request may carry, and how much of it an answer shows."""
 
 import base64
+import io
+import zipfile
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 from api_schemas.labels import MOST_SEGMENTS
 from tests.service.conftest import Serve
-from tests.service.kit import Json, Served, npz, refused
+from tests.service.kit import MAX_BODY_BYTES, UNKNOWN, Json, Served, npz, refused
 
 POINT: Json = {
     "spaces": {
@@ -67,3 +69,82 @@ def test_a_conflict_shows_where_labels_differ_however_long_they_are(on_both: Ser
 
 def test_as_many_connections_are_held_as_the_settings_allow(start: Serve) -> None:
     assert start(pool_size=3).services.database.engine.pool.size() == 3  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ([1] * 9, ["shape", "at most 8 items"]),
+        ([2**12, 2**12, 2], ["shape", 2**25, 2**24]),
+        ([2**25], ["shape.0", 2**24]),
+        ([0], ["shape.0"]),
+        ([True], ["shape.0", "must be a number"]),
+    ],
+)
+def test_an_array_has_so_many_axes_and_numbers_and_no_more(served: Served, shape: Any, words: list[object]) -> None:
+    spaces = {"observations": {"point": {"dtype": "uint8", "shape": shape}}, "actions": POINT["spaces"]["actions"]}
+    answer = served.client.post("/projects", json={"name": "large", "environment": {"spaces": spaces}})
+    refused(answer, 422, "malformed-request", *words)
+
+
+def test_an_observation_has_so_many_streams_and_no_more(served: Served) -> None:
+    stream = {"dtype": "uint8", "shape": (1,)}
+    for count in (64, 65):
+        streams = {f"point{number}": stream for number in range(count)}
+        spaces = {"observations": streams, "actions": POINT["spaces"]["actions"]}
+        answer = served.client.post("/projects", json={"name": f"{count}", "environment": {"spaces": spaces}})
+        assert answer.status_code == (201 if count == 64 else 422), answer.text
+
+
+def test_files_of_one_request_share_what_they_may_unpack_to(served: Served) -> None:
+    project = served.project(environment=POINT)
+    still = [npz({"point": np.full((MAX_BODY_BYTES // 3, 1), number, np.uint8)}) for number in range(3)]
+    small = [compressed(file) for file in still]
+    assert sum(map(len, small)) < MAX_BODY_BYTES // 100
+    answer = served.send(project, [(f"{number}.npz", file) for number, file in enumerate(small)])
+    refused(answer, 400, "foreign-file", "2.npz", "the files before it", MAX_BODY_BYTES)
+    assert served.show(project)["counts"]["pool_trajectories"] == 0
+    assert served.send(project, [(f"{number}.npz", file) for number, file in enumerate(small[:2])]).status_code == 201
+
+
+def test_a_file_has_so_many_members_and_no_more(served: Served) -> None:
+    project = served.project(environment=POINT)
+    many = npz({f"point{number}": np.zeros((2, 1), np.uint8) for number in range(257)})
+    refused(served.send(project, [("many.npz", many)]), 400, "foreign-file", "many.npz", 257, 256)
+
+
+def test_a_list_of_wrong_values_is_refused_by_its_first(served: Served) -> None:
+    project = served.project(environment=POINT)
+    sent = labeled(2) | {"actions": ["wrong"] * 100_000}
+    problem = refused(served.label(project, [], trajectories=[sent]), 422, "malformed-request", "actions.0")
+    assert len(problem["invalid_params"]) <= 3
+    assert len(problem["detail"]) < 2000
+
+
+def test_a_refusal_shows_so_many_fields_and_so_much_of_each(served: Served) -> None:
+    body = {f"field{number}": "x" * 5000 for number in range(500)}
+    problem = refused(served.client.post("/projects", json=body), 422, "malformed-request")
+    assert len(problem["invalid_params"]) == 20
+    assert max(len(param["value"]) for param in problem["invalid_params"]) == 200
+
+
+def test_a_body_that_brings_no_data_is_short(served: Served) -> None:
+    body = b'{"name": "' + b"x" * served.settings.max_json_bytes + b'"}'
+    answer = served.client.post("/projects", content=body, headers={"Content-Type": "application/json"})
+    refused(answer, 413, "body-too-large", len(body), served.settings.max_json_bytes)
+
+
+@pytest.mark.parametrize("value", [True, "5", "x", None, [5]])
+def test_a_number_in_a_body_is_a_number(served: Served, value: Any) -> None:
+    answer = served.client.post("/acquire", json={"project": UNKNOWN, "count": value})
+    refused(answer, 422, "malformed-request", "count")
+    assert served.client.post("/acquire", json={"project": UNKNOWN, "count": 5.0}).status_code == 404
+
+
+def compressed(file: bytes) -> bytes:
+    """The same members, deflated."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(file)) as whole, zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as small:
+        for name in whole.namelist():
+            small.writestr(name, whole.read(name))
+    return buffer.getvalue()

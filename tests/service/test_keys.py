@@ -65,8 +65,8 @@ def test_with_a_key_the_service_listens_to_other_machines(
     secret = command("key", "create", "ada", "--scope", "admin", "--data", str(tmp_path)).strip()
     name = _own_address()
     monkeypatch.setenv("ASIM_ALLOWED_HOSTS", f'["127.0.0.1", "{name}"]')
-    with served(tmp_path, host="0.0.0.0") as url:  # noqa: S104
-        outside = url.replace("0.0.0.0", name)  # noqa: S104
+    with served(tmp_path, host="0.0.0.0") as url:
+        outside = url.replace("0.0.0.0", name)
         assert httpx.get(f"{outside}/projects").status_code == 401
         with Client(outside, secret) as client:
             assert list(client.projects()) == []
@@ -74,7 +74,7 @@ def test_with_a_key_the_service_listens_to_other_machines(
             client.delete_key(keys[0].id)
             with pytest.raises(ServiceError, match="not known or was revoked"):
                 client.create_key(keys[0])  # type: ignore[arg-type]  # whatever is sent, nobody looks at it
-        with Client(url.replace("0.0.0.0", "127.0.0.1")) as client, pytest.raises(NotFound):  # noqa: S104
+        with Client(url.replace("0.0.0.0", "127.0.0.1")) as client, pytest.raises(NotFound):
             client.delete_key(keys[0].id)
 
 

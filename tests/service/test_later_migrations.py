@@ -40,8 +40,8 @@ def test_going_back_before_explorations_forgets_what_was_only_proposed(url: str)
     scored, proposed = (quoted(url, UUID(int=FIRST.int + more)) for more in (4, 40))
     columns = "project_id, round_id, strategy, status, memberships, shards, selections, created_at"
     places = "rank, project_id, trajectory_id, start, score"
-    scoring = f"INSERT INTO scoring (id, mode, {columns}) SELECT '{proposed}', 'explore', {columns} FROM scoring"  # noqa: S608
-    queue = f"INSERT INTO queue (scoring_id, actions, {places}) SELECT '{proposed}', '[6]', {places} FROM queue"  # noqa: S608
+    scoring = f"INSERT INTO scoring (id, mode, {columns}) SELECT '{proposed}', 'explore', {columns} FROM scoring"
+    queue = f"INSERT INTO queue (scoring_id, actions, {places}) SELECT '{proposed}', '[6]', {places} FROM queue"
     write(
         url,
         f"{scoring} WHERE id = '{scored}'",
@@ -67,7 +67,7 @@ def test_confidence_comes_and_goes_with_its_migration(url: str) -> None:
     migrate(url, "0007")
     for table in ("queue", "acquisition_item"):
         assert {row["confidence"] for row in read(url)[table]} == {None}
-        write(url, f"UPDATE {table} SET confidence = 0.5")  # noqa: S608
+        write(url, f"UPDATE {table} SET confidence = 0.5")
     downgrade(url, "0006")
     assert (version(url), schema_of(url), read(url)) == ("0006", schema, before)
     check_references(url)
@@ -90,13 +90,13 @@ def test_going_back_to_the_third_schema_leaves_nothing_that_its_service_does_not
     answer = {"strategy": "confident_cycle", "requested_strategy": "cycle", "items": [{"rank": 0, "confidence": 0.5}]}
     write(
         url,
-        f"UPDATE round SET model_error = '{error}' WHERE project_id = '{quoted(url, FIRST)}'",  # noqa: S608
-        f"UPDATE scoring SET strategy = 'confident_cycle' WHERE id = '{scored}'",  # noqa: S608
-        f"UPDATE job SET payload = '{payload}' WHERE state = 'done'",  # noqa: S608
-        f"UPDATE job SET subject_id = '{scored}', kind = 'select_queue' WHERE state = 'queued'",  # noqa: S608
+        f"UPDATE round SET model_error = '{error}' WHERE project_id = '{quoted(url, FIRST)}'",
+        f"UPDATE scoring SET strategy = 'confident_cycle' WHERE id = '{scored}'",
+        f"UPDATE job SET payload = '{payload}' WHERE state = 'done'",
+        f"UPDATE job SET subject_id = '{scored}', kind = 'select_queue' WHERE state = 'queued'",
         "UPDATE acquisition SET strategy = 'fidelity', requested_strategy = 'confident_cycle' WHERE status = 'labeled'",
-        f"UPDATE model_version SET kind = 'masked_inverse_dynamics' WHERE project_id = '{quoted(url, FIRST)}'",  # noqa: S608
-        "INSERT INTO idempotency (caller, route, key, request_sha256, status, body, expires_at) "  # noqa: S608
+        f"UPDATE model_version SET kind = 'masked_inverse_dynamics' WHERE project_id = '{quoted(url, FIRST)}'",
+        "INSERT INTO idempotency (caller, route, key, request_sha256, status, body, expires_at) "
         f"VALUES ('local', 'POST /acquire', 'k', 'x', 201, '{json.dumps(answer)}', '2030-01-01 00:00:00')",
     )
     _set_policies(url, {"strategy": "confident_cycle", "batch_rule": "signatures"})
@@ -145,11 +145,11 @@ def test_going_back_ends_rounds_whose_networks_an_older_service_cannot_read(url:
     write(
         url,
         *(
-            f"INSERT INTO model_version (id, kind, {columns}) SELECT '{name}', '{kind}', {copies[kind]} "  # noqa: S608
+            f"INSERT INTO model_version (id, kind, {columns}) SELECT '{name}', '{kind}', {copies[kind]} "
             f"FROM model_version WHERE round_id = '{owner}' AND kind = 'world_model'"
             for (kind, owner), name in names.items()
         ),
-        f"UPDATE round SET status = 'scoring' WHERE id = '{waiting}'",  # noqa: S608
+        f"UPDATE round SET status = 'scoring' WHERE id = '{waiting}'",
     )
     downgrade(url, "0003")
     after = read(url)
@@ -187,8 +187,8 @@ def test_rounds_of_the_other_kind_of_world_model_end(url: str, forth: bool) -> N
     unfinished = quoted(url, UUID(int=SECOND.int + 3))
     write(
         url,
-        f"UPDATE model_version SET config = '{config}' WHERE kind = 'world_model'",  # noqa: S608
-        f"UPDATE round SET status = 'scoring' WHERE id = '{unfinished}'",  # noqa: S608
+        f"UPDATE model_version SET config = '{config}' WHERE kind = 'world_model'",
+        f"UPDATE round SET status = 'scoring' WHERE id = '{unfinished}'",
     )
     if forth:
         migrate(url)

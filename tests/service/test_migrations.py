@@ -184,11 +184,11 @@ def test_going_back_says_what_is_new_in_the_first_schemas_words(url: str) -> Non
     quoted = [str(each) if "postgresql" in url else each.hex for each in (job, rounded, leased, labeled)]
     write(
         url,
-        f"UPDATE job SET state = 'cancelled' WHERE id = '{quoted[0]}'",  # noqa: S608
-        f"UPDATE round SET status = 'cancelled' WHERE id = '{quoted[1]}'",  # noqa: S608
-        f"UPDATE acquisition SET status = 'expired' WHERE id = '{quoted[2]}'",  # noqa: S608
-        f"UPDATE acquisition SET mode = 'explore' WHERE id = '{quoted[3]}'",  # noqa: S608
-        f"UPDATE acquisition_item SET actions = '[1]' WHERE acquisition_id = '{quoted[3]}'",  # noqa: S608
+        f"UPDATE job SET state = 'cancelled' WHERE id = '{quoted[0]}'",
+        f"UPDATE round SET status = 'cancelled' WHERE id = '{quoted[1]}'",
+        f"UPDATE acquisition SET status = 'expired' WHERE id = '{quoted[2]}'",
+        f"UPDATE acquisition SET mode = 'explore' WHERE id = '{quoted[3]}'",
+        f"UPDATE acquisition_item SET actions = '[1]' WHERE acquisition_id = '{quoted[3]}'",
         "UPDATE job SET project_id = NULL, kind = 'canary' WHERE state = 'queued'",
         "INSERT INTO idempotency (caller, route, key, request_sha256, expires_at) "
         "VALUES ('local', 'POST /labels', 'k', 'x', '2030-01-01 00:00:00')",
