@@ -1,11 +1,11 @@
 """Acquisitions: batches of segments given out under a lease."""
 
-from typing import Literal
+from typing import Annotated, Literal
 from uuid import UUID
 
 from pydantic import Field, model_validator
 
-from api_schemas.base import Integer, Number, Schema, Timestamp, TrajectoryId
+from api_schemas.base import AS_JSON, Integer, Number, Schema, Timestamp, TrajectoryId
 from api_schemas.labels import Action
 from api_schemas.projects import Budget
 from api_schemas.strategies import StrategyName
@@ -23,7 +23,7 @@ class AcquireRequest(Schema):
     """
 
     project: UUID
-    count: Integer = Field(ge=1, le=10_000)
+    count: Annotated[int, Field(ge=1, le=10_000), AS_JSON]
     mode: Mode = "pool"
     strategy: str | None = None
     purpose: Purpose = "pool"

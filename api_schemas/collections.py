@@ -1,17 +1,18 @@
 """Collections: a behavior policy runs in a simulator and its trajectories join a project."""
 
+from typing import Annotated
 from uuid import UUID
 
 from pydantic import Field
 
-from api_schemas.base import Integer, Schema
+from api_schemas.base import AS_JSON, Positive, Schema, Seed
 from api_schemas.trajectories import SplitChoice
 
 
 class CollectionLabels(Schema):
     """Record labels for `per_action` effective transitions of each action (one that changes the observation)."""
 
-    per_action: Integer = Field(ge=1)
+    per_action: Positive
 
 
 class CollectionCreate(Schema):
@@ -23,7 +24,7 @@ class CollectionCreate(Schema):
 
     project: UUID
     behavior: str = Field(default="mixture", min_length=1, max_length=80)
-    transitions: Integer = Field(ge=1, le=10_000_000)
-    seed: Integer = Field(default=0, ge=0, lt=2**31)
+    transitions: Annotated[int, Field(ge=1, le=10_000_000), AS_JSON]
+    seed: Seed = 0
     split: SplitChoice = "auto"
     labels: CollectionLabels | None = None

@@ -6,17 +6,25 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from api_schemas.base import Integer, Number, Schema
+from api_schemas.base import AS_JSON, Integer, Number, Positive, Schema
 
 MOST_AXES = 8  # of one array, time not counted
 MOST_NUMBERS = 2**24  # of one observation in one stream
 MOST_COORDINATES = 1_000  # of an action
+MOST_HIGHS = 10_000  # places along the last axis that have a largest value of their own
 MOST_ACTIONS = 1_000  # of a discrete space
 MOST_ENTRIES = 64  # streams of an observation, groups of actions, options of a simulator
 DType = Literal["uint8", "int32", "int64", "float32", "float64"]
 
 
-StreamName = Annotated[str, Field(pattern="^[A-Za-z0-9_.-]{1,80}$")]  # a slash would name a chunk of another stream
+def _not_reserved(name: str) -> str:
+    if name == "__metadata__":
+        raise ValueError("is what files of arrays call something else")
+    return name
+
+
+# A slash would name a chunk of another stream.
+StreamName = Annotated[str, Field(pattern="^[A-Za-z0-9_.-]{1,80}$"), AfterValidator(_not_reserved)]
 
 
 def _at_most(most: int) -> AfterValidator:
@@ -31,8 +39,8 @@ def _at_most(most: int) -> AfterValidator:
 
 
 Name = Annotated[str, Field(max_length=200)]
-Axis = Annotated[Integer, Field(gt=0, le=MOST_NUMBERS)]
-Shape = Annotated[tuple[Axis, ...], Field(max_length=MOST_AXES)]
+Axis = Annotated[int, Field(gt=0, le=MOST_NUMBERS), AS_JSON]
+Shape = Annotated[tuple[Axis, ...], Field(max_length=MOST_AXES, fail_fast=True)]
 
 
 class Stream(Schema):
@@ -43,12 +51,13 @@ class Stream(Schema):
 
     dtype: DType
     shape: Annotated[Shape, _at_most(MOST_NUMBERS)]
-    high: Integer | Annotated[tuple[Integer, ...], Field(max_length=MOST_NUMBERS)] | None = None
+    high: Integer | Annotated[tuple[Integer, ...], Field(max_length=MOST_HIGHS, fail_fast=True)] | None = None
 
     @model_validator(mode="after")
     def _high_fits_the_last_axis(self) -> "Stream":
         if isinstance(self.high, tuple) and (not self.shape or len(self.high) != self.shape[-1]):
-            raise ValueError(f"high: {self.high} needs one number for each place of the last axis of {self.shape}")
+            count = len(self.high)
+            raise ValueError(f"high: has {count} numbers, needs one for each place of the last axis of {self.shape}")
         return self
 
 
@@ -56,10 +65,11 @@ class DiscreteActions(Schema):
     """The integers 0 to n - 1. `groups` names disjoint sets of them for which model error is reported apart."""
 
     kind: Literal["discrete"] = "discrete"
-    n: Integer = Field(ge=2, le=MOST_ACTIONS)
-    names: Annotated[tuple[Name, ...], Field(max_length=MOST_ACTIONS)] = ()
+    n: Annotated[int, Field(ge=2, le=MOST_ACTIONS), AS_JSON]
+    names: Annotated[tuple[Name, ...], Field(max_length=MOST_ACTIONS, fail_fast=True)] = ()
     groups: Annotated[
-        dict[Name, Annotated[tuple[Integer, ...], Field(max_length=MOST_ACTIONS)]], Field(max_length=MOST_ENTRIES)
+        dict[Name, Annotated[tuple[Integer, ...], Field(max_length=MOST_ACTIONS, fail_fast=True)]],
+        Field(max_length=MOST_ENTRIES),
     ] = {}
 
 
@@ -78,7 +88,9 @@ Actions = Annotated[DiscreteActions | BoxActions, Field(discriminator="kind")]
 class Spaces(Schema):
     """What an observation and an action of a project look like."""
 
-    observations: dict[StreamName, Stream] = Field(min_length=1, max_length=MOST_ENTRIES)
+    observations: dict[StreamName, Stream] = Field(
+        min_length=1, max_length=MOST_ENTRIES, json_schema_extra={"additionalProperties": False}
+    )
     actions: Actions
 
 
@@ -87,9 +99,9 @@ class MiniGridOptions(Schema):
 
     task: Literal["key_delivery", "ball_delivery", "object_matching", "any"] = "any"
     room_size: Literal[6, 8] = 6
-    objects: Integer = Field(default=3, ge=3, le=14)
-    noisy_tiles: Integer = Field(default=0, ge=0, le=4)
-    max_steps: Integer = Field(default=120, ge=1)
+    objects: Annotated[int, Field(ge=3, le=14), AS_JSON] = 3
+    noisy_tiles: Annotated[int, Field(ge=0, le=4), AS_JSON] = 0
+    max_steps: Positive = 120
 
     @model_validator(mode="after")
     def _room_for_the_objects(self) -> "MiniGridOptions":

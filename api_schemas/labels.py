@@ -3,18 +3,21 @@
 from typing import Annotated, Literal
 from uuid import UUID
 
-from pydantic import Base64Bytes, Field, StrictInt, model_validator
+from pydantic import Base64Bytes, Discriminator, Field, Tag, model_validator
 
-from api_schemas.base import Integer, Number, Schema, Split, Timestamp, TrajectoryId
+from api_schemas.base import Integer, Natural, Number, Schema, Split, Timestamp, TrajectoryId
 from api_schemas.environments import MOST_ACTIONS, MOST_COORDINATES
 from api_schemas.trajectories import SplitChoice
 
 MOST_STEPS = 1_000_000  # of one segment or trajectory
 Vector = Annotated[list[Number], Field(max_length=MOST_COORDINATES, fail_fast=True)]
-Action = StrictInt | Vector
+Action = Annotated[
+    Annotated[Integer, Tag("integer")] | Annotated[Vector, Tag("vector")],
+    Discriminator(lambda value: "vector" if isinstance(value, list) else "integer"),
+]
 # A list ends at its first error: with one for each wrong step, a body could ask for a thousand times its size.
 Steps = Annotated[list[Action], Field(min_length=1, max_length=MOST_STEPS, fail_fast=True)]
-Choices = Annotated[list[StrictInt], Field(max_length=MOST_ACTIONS, fail_fast=True)]
+Choices = Annotated[list[Integer], Field(max_length=MOST_ACTIONS, fail_fast=True)]
 ActionSets = Annotated[list[Choices], Field(max_length=MOST_STEPS, fail_fast=True)]
 Starts = Annotated[list[Integer], Field(max_length=MOST_STEPS, fail_fast=True)]
 MOST_SEGMENTS = 20_000  # that the labeled trajectories of one request may bring
@@ -35,7 +38,7 @@ class LabelItem(Schema):
     """
 
     trajectory: TrajectoryId
-    start: Integer = Field(ge=0)
+    start: Natural
     actions: Steps
     action_sets: ActionSets | None = None
     residual: Number | None = Field(default=None, ge=0)
@@ -55,7 +58,7 @@ class LabeledTrajectory(Schema):
     action_sets: ActionSets | None = None
     starts: Starts | None = None
     split: SplitChoice = "auto"
-    rank: Integer | None = Field(default=None, ge=0)
+    rank: Natural | None = None
 
     @model_validator(mode="after")
     def _each_segment_once(self) -> "LabeledTrajectory":

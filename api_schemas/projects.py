@@ -1,15 +1,16 @@
 """Projects: one environment, one model family, one labeling policy."""
 
-from typing import Literal
+from typing import Annotated, Literal
 from uuid import UUID
 
 from pydantic import Field, model_validator
 
-from api_schemas.base import Integer, Number, Schema, Timestamp
+from api_schemas.base import AS_JSON, Natural, Number, Positive, Schema, Seed, Timestamp
 from api_schemas.environments import Environment, Spaces, bounded_grid, takes_grid
 from api_schemas.strategies import DEFAULT_BATCH_RULE, DEFAULT_STRATEGY, BatchRuleName, StrategyName
 
 Family = Literal["grid"]
+Steps = Annotated[int, Field(ge=1, le=1_000_000), AS_JSON]
 
 
 class LabelingPolicy(Schema):
@@ -23,8 +24,8 @@ class LabelingPolicy(Schema):
 
     strategy: StrategyName = DEFAULT_STRATEGY
     batch_rule: BatchRuleName = DEFAULT_BATCH_RULE
-    round_labels: Integer = Field(default=100, ge=0)
-    label_budget: Integer | None = Field(default=None, ge=1)
+    round_labels: Natural = 100
+    label_budget: Positive | None = None
     lease_seconds: Number = Field(default=3600.0, gt=0, le=30 * 86400)
 
 
@@ -34,10 +35,10 @@ class ProjectCreate(Schema):
     name: str = Field(min_length=1, max_length=80, pattern=r"^[^\s/\x00-\x1f](?:[^/\x00-\x1f]*[^\s/\x00-\x1f])?$")
     environment: Environment
     family: Family | None = Field(default=None, description="default: the one that takes the spaces, if any does")
-    segment_length: Integer = Field(default=1, ge=1, le=1_000_000)
-    stride: Integer | None = Field(default=None, ge=1, le=1_000_000, description="default: segment_length")
+    segment_length: Steps = 1
+    stride: Steps | None = Field(default=None, description="default: segment_length")
     held_out_fraction: Number = Field(default=0.1, ge=0, lt=1)
-    seed: Integer = Field(default=0, ge=0, lt=2**31)
+    seed: Seed = 0
     policy: LabelingPolicy = LabelingPolicy()
 
     @model_validator(mode="after")
@@ -67,8 +68,8 @@ class ProjectPatch(Schema):
 
     strategy: StrategyName | None = None
     batch_rule: BatchRuleName | None = None
-    round_labels: Integer | None = Field(default=None, ge=0)
-    label_budget: Integer | None = Field(default=None, ge=1)
+    round_labels: Natural | None = None
+    label_budget: Positive | None = None
     lease_seconds: Number | None = Field(default=None, gt=0, le=30 * 86400)
 
 

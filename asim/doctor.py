@@ -43,8 +43,13 @@ class Installation:
 
     settings: Settings
     database: Database
-    now: datetime
+    clock: Callable[[], datetime]
     thorough: bool = True
+
+    @property
+    def now(self) -> datetime:
+        """This machine's time."""
+        return self.clock()
 
     @property
     def stores(self) -> list[Blobs]:
@@ -65,20 +70,34 @@ class Installation:
 Check = Callable[[Installation], Iterator[Fault]]
 
 
-def examine(settings: Settings, now: datetime, *, thorough: bool = True) -> Iterator[tuple[str, list[Fault]]]:
+def examine(
+    settings: Settings, clock: Callable[[], datetime], *, thorough: bool = True
+) -> Iterator[tuple[str, list[Fault]]]:
     """Each check's name with the faults that it found. Without a database of our schema only what needs none."""
     database = open_database(settings.resolved_database_url(), pool_size=2)
-    held = Installation(settings, database, now, thorough)
+    held = Installation(settings, database, clock, thorough)
     try:
         for name, check in FIRST.items():
-            faults = list(check(held))
+            faults = _found(check, held)
             yield name, faults
             if name == "database" and faults:
                 return
         for name, check in THEN.items():
-            yield name, list(check(held))
+            yield name, _found(check, held)
     finally:
         database.close()
+
+
+def _found(check: Check, held: Installation) -> list[Fault]:
+    """A check that breaks down is a fault too, and the others go on."""
+    faults: list[Fault] = []
+    try:
+        for each in check(held):
+            faults.append(each)
+    except Exception as error:  # the boundary: whatever is wrong here is what somebody wants to know
+        sentence = f"the check broke down: {type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        faults.append(Fault(sentence, "see whether another check names the cause; else it is a defect of asim"))
+    return faults
 
 
 def permissions(held: Installation) -> Iterator[Fault]:
@@ -90,7 +109,7 @@ def permissions(held: Installation) -> Iterator[Fault]:
         state = folder.stat()
         if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
             yield Fault(f"this user may not write to {folder}", f"chown it to the user that runs the service: {folder}")
-        if state.st_mode & 0o007 and all(parent.stat().st_mode & 0o001 for parent in folder.parents):
+        if state.st_mode & 0o007 and all(parent.stat().st_mode & 0o001 for parent in folder.absolute().parents):
             mode = f"{state.st_mode & 0o777:o}"
             yield Fault(f"every user of this machine reaches into {folder} (mode {mode})", f"chmod o= {folder}")
 
@@ -139,33 +158,42 @@ def clock(held: Installation) -> Iterator[Fault]:
     """The database's clock, and times of rows that are still to come."""
     with held.database.read() as session:
         if held.database.engine.dialect.name == "postgresql":
-            apart = session.scalars(select(func.clock_timestamp())).one() - held.now
+            before = held.now
+            theirs = session.scalars(select(func.clock_timestamp())).one()
+            apart = theirs - min(max(theirs, before), held.now)  # 0 where it lies between: the answer took that long
             if abs(apart) > SKEW:
                 yield Fault(f"the database server's clock is {_apart(apart)} of this machine's", _SYNCHRONISE)
         for what, column in (("event", EventRow.created_at), ("sign of a worker", WorkerRow.heartbeat_at)):
             newest = session.scalar(select(func.max(column)))
-            if newest is not None and newest > held.now + SKEW:
-                yield Fault(f"the newest {what} is {_apart(newest - held.now)} of this machine's clock", _SYNCHRONISE)
+            now = held.now
+            if newest is not None and newest > now + SKEW:
+                yield Fault(f"the newest {what} is {_apart(newest - now)} of this machine's clock", _SYNCHRONISE)
 
 
 def blobs(held: Installation) -> Iterator[Fault]:
     """Blobs that rows refer to and that are not there, or not what they were."""
-    with held.database.read() as session:
-        needed = list(references(session))
     faults = []
     for store in held.stores:
         try:
+            needed = _needed(held, store)
             there = {(blob.kind, blob.sha256) for blob in store.stored()}
-            for kind, sha256 in needed:
-                if kind in store.kinds and (kind, sha256) not in there:
-                    faults.append(Fault(f"blob {kind}/{sha256} is not in the store", _FROM_BACKUP))
-                elif kind in store.kinds and held.thorough:
-                    faults += _read(store, kind, sha256)
+            if held.thorough:
+                faults += [fault for each in needed & there for fault in _read(store, *each)]
+            there |= {(blob.kind, blob.sha256) for blob in store.discarded()}  # whoever asks for it gets it back
+            gone = (needed - there) & _needed(held, store)  # not what was replaced meanwhile, such as a checkpoint
+            faults += [
+                Fault(f"blob {kind}/{sha256} is not in the store", _FROM_BACKUP) for kind, sha256 in sorted(gone)
+            ]
         except BlobsUnavailable as error:
             yield Fault(f"a store does not answer: {error.detail}", "start it, or correct ASIM_BLOBS_URL")
     yield from faults[:SHOWN]
     if len(faults) > SHOWN:
         yield Fault(f"{len(faults) - SHOWN} more blobs are missing or damaged", _FROM_BACKUP)
+
+
+def _needed(held: Installation, store: Blobs) -> set[tuple[str, str]]:
+    with held.database.read() as session:
+        return {(each.kind, each.sha256) for each in references(session) if each.kind in store.kinds}
 
 
 def queues(held: Installation) -> Iterator[Fault]:

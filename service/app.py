@@ -58,9 +58,10 @@ def create_app(settings: Settings | None = None, clock: Callable[[], datetime] =
     app.state.services = open_services(settings, clock)
     description.install(app)
     problems.install(app)
-    security.install(app, app.state.services)
-    for module in (projects, trajectories, acquisitions, labels, rounds, jobs, system):
-        app.include_router(module.router)
+    routers = [module.router for module in (projects, trajectories, acquisitions, labels, rounds, jobs, system)]
+    security.install(app, app.state.services, routers)
+    for router in routers:
+        app.include_router(router)
     app.include_router(page.router)
     return app
 

@@ -5,10 +5,13 @@ until then is there.
 """
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 
 from pydantic import ValidationError
 from sqlalchemy.orm import Session
@@ -47,9 +50,17 @@ def backup(url: str, stores: Iterable[Blobs], folder: Path, now: datetime) -> Ma
     """Into a folder that is not there yet. Raises BackupExists, BlobsUnavailable."""
     if folder.exists() and any(folder.iterdir()):
         raise BackupExists(str(folder))
-    unfinished = folder.with_name(f"{folder.name}.unfinished")
+    with _unfinished(folder) as unfinished:
+        manifest = _write(url, stores, unfinished, now)
+        if folder.exists():
+            folder.rmdir()
+        unfinished.rename(folder)
+    return manifest
+
+
+def _write(url: str, stores: Iterable[Blobs], unfinished: Path, now: datetime) -> Manifest:
     tables = unfinished / "tables"
-    tables.mkdir(parents=True, exist_ok=True)
+    tables.mkdir()
     with transfer.snapshot(url) as connection:
         revision = revision_of(connection)
         counts = transfer.dump(connection, tables)
@@ -64,16 +75,24 @@ def backup(url: str, stores: Iterable[Blobs], folder: Path, now: datetime) -> Ma
         missing=missing,
     )
     (unfinished / MANIFEST).write_text(manifest.model_dump_json(indent=2))
-    if folder.exists():
-        folder.rmdir()
-    unfinished.rename(folder)
     return manifest
+
+
+@contextmanager
+def _unfinished(folder: Path) -> Iterator[Path]:
+    """A new folder beside it, this user's alone: there are keys' hashes, tokens and simulator states in a backup."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    made = Path(mkdtemp(prefix=f"{folder.name}.unfinished-", dir=folder.parent))
+    try:
+        yield made
+    finally:
+        rmtree(made, ignore_errors=True)  # it is gone where it was renamed
 
 
 def restore(folder: Path, url: str, stores: Iterable[Blobs]) -> Manifest:
     """Into an empty database: blobs first, then all rows at once.
 
-    Raises UnreadableBackup, NotEmpty, BlobsUnavailable; then nothing was written but blobs that nothing refers to.
+    Raises UnreadableBackup, NotEmpty, BlobsUnavailable; then no row was written, and no blob that a row refers to.
     """
     manifest = read_manifest(folder)
     for name, table in manifest.tables.items():
@@ -84,7 +103,9 @@ def restore(folder: Path, url: str, stores: Iterable[Blobs]) -> Manifest:
     copied, damaged = _copy_blobs(kept, _stores(folder), list(stores))
     if damaged or copied != manifest.blobs:
         raise UnreadableBackup(str(folder), f"holds {copied} whole blobs, its manifest tells of {manifest.blobs}")
-    transfer.load(folder / "tables", url, manifest.revision)
+    transfer.load(
+        folder / "tables", url, manifest.revision, {name: each.rows for name, each in manifest.tables.items()}
+    )
     return manifest
 
 

@@ -323,6 +323,15 @@ class BodyTooLarge(ServiceError):
     status_code = 413
 
 
+class NoDatabase(ServiceError):
+    """There is no database, or it is of another version."""
+
+    status_code = 409
+
+    def __init__(self, url: str, reason: str) -> None:
+        super().__init__(f"the database {url} {reason}")
+
+
 class NotEmpty(ServiceError):
     """Rows can be written to an empty database only."""
 
@@ -345,7 +354,7 @@ class UnreadableBackup(ServiceError):
     """A backup is damaged, or is none."""
 
     def __init__(self, name: str, reason: str) -> None:
-        super().__init__(f"{name} {reason}; nothing was restored")
+        super().__init__(f"{name} {reason}; no row was restored")
 
 
 class JobFinished(ServiceError):

@@ -36,6 +36,11 @@ def store(blobs: Blobs, spaces: Spaces, arrays: Mapping[str, NDArray[Any]], sour
     arrays: one a stream, (T + 1, ...), T >= 1.
     """
     streams.check(spaces, arrays, source)
+    return write(blobs, spaces, arrays, source)
+
+
+def write(blobs: Blobs, spaces: Spaces, arrays: Mapping[str, NDArray[Any]], source: str) -> StoredTrajectory:
+    """Write the blob of a trajectory that was checked."""
     data = codec.encode(arrays)
     told: dict[str, object] = {name: spec.model_dump(mode="json") for name, spec in spaces.observations.items()}
     transitions = len(next(iter(arrays.values()))) - 1

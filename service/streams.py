@@ -31,7 +31,7 @@ def read(spaces: Spaces, files: Sequence[tuple[str, BinaryIO]], max_bytes: int) 
 
     files: with the name to call each by. max_bytes: that all together may unpack to.
 
-    Raises ForeignFile, InvalidTrajectory.
+    All of them are checked: who refuses one has stored none. Raises ForeignFile, InvalidTrajectory.
     """
     opened, total = [], 0
     for source, file in files:
@@ -40,7 +40,10 @@ def read(spaces: Spaces, files: Sequence[tuple[str, BinaryIO]], max_bytes: int) 
         if total > max_bytes:
             raise ForeignFile(source, f"and the files before it unpack to {total} bytes, {max_bytes} are allowed")
         check_forms(spaces, opened[-1].forms, source)
-    return [file.arrays() for file in opened]
+    found = [file.arrays() for file in opened]
+    for one, arrays in zip(opened, found, strict=True):
+        check(spaces, arrays, one.source)
+    return found
 
 
 def check(spaces: Spaces, arrays: Mapping[str, NDArray[Any]], source: str) -> None:

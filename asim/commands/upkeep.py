@@ -10,6 +10,7 @@ import typer
 from asim.commands.processes import Data, settings_of
 
 if TYPE_CHECKING:
+    from service.backup import Manifest
     from service.settings import Settings
     from service.store.blobs import Blobs
 
@@ -27,7 +28,7 @@ def doctor(
     from service.clock import utc_now
 
     found = []
-    for each in examine(settings_of(data), utc_now(), thorough=not quick):
+    for each in examine(settings_of(data), utc_now, thorough=not quick):
         found.append(each)
         typer.echo("\n".join(report([each])))
     if any(faults for _, faults in found):
@@ -39,14 +40,11 @@ def backup(folder: Folder, data: Data = None) -> None:
     from service.backup import backup as make
     from service.clock import utc_now
 
-    settings = settings_of(data)
+    settings = _installed(data)
     manifest = make(settings.resolved_database_url(), _stores(settings), folder, utc_now())
     rows = sum(table.rows for table in manifest.tables.values())
     typer.echo(f"{folder}: {rows} rows, {sum(manifest.blobs.values())} blobs, schema {manifest.revision}")
-    if manifest.missing:
-        named = ", ".join(manifest.missing[:3])
-        typer.echo(f"{len(manifest.missing)} blobs are missing or damaged and not in it: {named}", err=True)
-        raise typer.Exit(1)
+    _tell_missing(manifest, "are missing or damaged and not in it")
 
 
 def restore(folder: Folder, data: Data = None) -> None:
@@ -58,6 +56,7 @@ def restore(folder: Folder, data: Data = None) -> None:
     manifest = bring_back(folder, settings.resolved_database_url(), _stores(settings))
     rows = sum(table.rows for table in manifest.tables.values())
     typer.echo(f"{rows} rows and {sum(manifest.blobs.values())} blobs of {manifest.created_at:%Y-%m-%d %H:%M:%S}Z")
+    _tell_missing(manifest, "were not in it when it was made")
 
 
 def gc(
@@ -71,7 +70,7 @@ def gc(
     from service.garbage import collect
     from service.store.database import open_database
 
-    settings = settings_of(data)
+    settings = _installed(data)
     with closing(open_database(settings.resolved_database_url(), pool_size=1)) as database:
         found = collect(database, _stores(settings), utc_now(), timedelta(hours=grace_hours), dry_run=dry_run)
     for what, blobs in (
@@ -104,6 +103,21 @@ def copy(
 
     counts = copy_rows(source, target)
     typer.echo(f"{sum(counts.values())} rows of {len(counts)} tables")
+
+
+def _installed(data: Path | None) -> "Settings":
+    """Settings of an installation that is there: to open what is not would make it."""
+    from service.store.database import check_newest
+
+    settings = settings_of(data)
+    check_newest(settings.resolved_database_url())
+    return settings
+
+
+def _tell_missing(manifest: "Manifest", what: str) -> None:
+    if manifest.missing:
+        typer.echo(f"{len(manifest.missing)} blobs {what}: {', '.join(manifest.missing[:3])}", err=True)
+        raise typer.Exit(1)
 
 
 def _stores(settings: "Settings") -> "list[Blobs]":

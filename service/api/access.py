@@ -3,13 +3,14 @@
 A key of one project fails closed: it reaches only endpoints that say how the project of a request is known.
 """
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import Depends, Request, Security
+from fastapi import APIRouter, Depends, Request, Security
 from fastapi.concurrency import run_in_threadpool
+from fastapi.routing import APIRoute
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from sqlalchemy import select
 
@@ -66,14 +67,38 @@ class Requires:
     reach: Reach | None = None
 
     async def __call__(self, request: Request, held: ServicesDep, who: CallerDep, _: Credentials) -> None:
+        self.check(who)
+        if who.project is not None and self.reach is not None:
+            await self.reach(request, held, who.project)
+
+    def check(self, who: Caller) -> None:
+        """What is known without the request. Raises NotAllowed."""
         if self.scope not in who.scopes and "admin" not in who.scopes:
             lacks = f"this needs the scope {self.scope!r}, the key has {', '.join(who.scopes)}"
             raise NotAllowed(f"authorization: {lacks}")
-        if who.project is None:
-            return
-        if self.reach is None:
+        if who.project is not None and self.reach is None:
             raise NotAllowed(f"authorization: this is about all projects, the key reaches {who.project} only")
-        await self.reach(request, held, who.project)
+
+
+class AccessTable:
+    """What each route requires, to be asked before a body is read: dependencies come after it."""
+
+    def __init__(self, routers: Iterable[APIRouter]) -> None:
+        self._routes = [
+            (route.path_regex, route.methods or set(), each.dependency)
+            for router in routers
+            for route in router.routes
+            if isinstance(route, APIRoute)
+            for each in route.dependencies
+            if isinstance(each.dependency, Requires)
+        ]
+
+    def check(self, request: Request) -> None:
+        """Of a request whose caller is known. Raises NotAllowed."""
+        who: Caller | None = getattr(request.state, "caller", None)
+        for pattern, methods, required in self._routes:
+            if who is not None and request.method in methods and pattern.match(request.url.path):
+                required.check(who)
 
 
 def requires(scope: Scope, reach: Reach | None = None) -> Any:

@@ -3,6 +3,8 @@
 Counted in this process's memory; another API process counts its own.
 """
 
+import hashlib
+from collections import OrderedDict
 from ipaddress import ip_address, ip_network
 from math import ceil
 from time import time
@@ -14,6 +16,8 @@ from limits.strategies import MovingWindowRateLimiter
 
 from service.errors import TooManyFailedKeys
 
+MOST_GOOD = 1_000
+
 
 class FailedKeys:
     """Failures of the last minute, by address and by the key that a secret claims to be of."""
@@ -21,6 +25,18 @@ class FailedKeys:
     def __init__(self, per_address: RateLimitItem, per_key: RateLimitItem) -> None:
         self._per_key, self._per_address = per_key, per_address
         self._limiter = MovingWindowRateLimiter(MemoryStorage())
+        self._good: OrderedDict[bytes, None] = OrderedDict()  # hashes of secrets that opened something, newest last
+
+    def vouch(self, secret: str) -> None:
+        """This secret opened something: the failures of others at its address do not lock it out."""
+        self._good[_hash(secret)] = None
+        self._good.move_to_end(_hash(secret))
+        if len(self._good) > MOST_GOOD:
+            self._good.popitem(last=False)
+
+    def is_good(self, secret: str) -> bool:
+        """Whether it opened something lately; it is looked up all the same."""
+        return _hash(secret) in self._good
 
     def check(self, host: str, key: UUID | None) -> None:
         """Raises TooManyFailedKeys."""
@@ -37,6 +53,10 @@ class FailedKeys:
     def _counted(self, host: str, key: UUID | None) -> list[tuple[RateLimitItem, tuple[str, ...]]]:
         network = _network(host)
         return [(self._per_address, ("address", network)), (self._per_key, ("key", network, str(key)))]
+
+
+def _hash(secret: str) -> bytes:
+    return hashlib.sha256(secret.encode("utf-8", "surrogateescape")).digest()
 
 
 def _network(host: str) -> str:

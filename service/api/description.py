@@ -18,7 +18,7 @@ from service.errors import ServiceError
 
 Json = dict[str, Any]
 PROBLEM = {PROBLEM_JSON: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-EVERYWHERE = {403: "The host is not a name of this service"}
+EVERYWHERE = {403: "The host is not a name of this service", 413: "The request is larger than this service takes"}
 WITH_VALUES = {422: "A value cannot be taken"}
 WITH_A_KEY = {
     401: "A valid API key is needed",
@@ -27,7 +27,7 @@ WITH_A_KEY = {
     503: "The database is unavailable",
 }
 WITH_A_NAME = {404: "There is no such thing"}
-WITH_A_BODY = {400: "The body cannot be read", 413: "The request is larger than this service takes"}
+WITH_A_BODY = {400: "The body cannot be read"}
 REPLACED = ("HTTPValidationError", "ValidationError")  # FastAPI's own, which this service answers as a problem
 REPLACED_TEXT = "Validation Error"
 

@@ -123,7 +123,7 @@ def _store_trajectories(held: Services, request: LabelsRequest) -> list[LabeledU
     arrays = streams.read(spaces, files, held.settings.max_body_bytes)
     return [
         LabeledUpload(
-            pool.store(held.blobs, spaces, observed, name),
+            pool.write(held.blobs, spaces, observed, name),
             trajectory.actions,
             trajectory.action_sets,
             trajectory.starts,

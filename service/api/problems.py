@@ -60,7 +60,7 @@ def _malformed(request: Request, error: Exception) -> JSONResponse:
     params = [
         InvalidParam(
             name=_printable(".".join(str(part) for part in problem["loc"] if part != "body")) or "body",
-            reason=str(problem["msg"]).removeprefix("Value error, "),
+            reason=_printable(str(problem["msg"]).removeprefix("Value error, ")),
             value=_printable(_shown(problem.get("input"))),
         )
         for problem in error.errors()[:MOST_SHOWN]

@@ -6,18 +6,19 @@ is known that they may send one.
 
 import re
 import time
+from collections.abc import Iterable
 from http import HTTPStatus
 from ipaddress import ip_address
 from uuid import uuid4
 
-from fastapi import FastAPI, HTTPException, Request
+from fastapi import APIRouter, FastAPI, HTTPException, Request
 from fastapi.concurrency import run_in_threadpool
 from limits import RateLimitItemPerMinute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import keys, origin, traces
 from service.api import problems
-from service.api.access import NO_KEY, ON_THIS_MACHINE, Caller
+from service.api.access import NO_KEY, ON_THIS_MACHINE, AccessTable, Caller
 from service.api.attempts import FailedKeys
 from service.api.dependencies import Services
 from service.api.headers import CORRELATION, HEADERS
@@ -27,19 +28,39 @@ from service.settings import Settings
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 PUBLIC = frozenset({"/", "/dashboard", "/openapi.json", "/health/live", "/health/ready"})
 PUBLIC_FOLDER = "/dashboard/"
-FORWARDED = ("forwarded", "x-forwarded-for", "x-real-ip")  # a proxy of this machine speaks for somebody elsewhere
+DATA_PATH = "/trajectories"
+MOST_VALUES, MOST_CONTAINERS = 8_000_000, 1_000_000  # of a JSON body: a list of three bytes takes 64
+FORWARDED = (  # a proxy of this machine speaks for somebody elsewhere
+    "forwarded",
+    "via",
+    "x-forwarded-for",
+    "x-forwarded-host",
+    "x-forwarded-proto",
+    "x-real-ip",
+)
 
 
-def install(app: FastAPI, services: Services) -> None:
+def install(app: FastAPI, services: Services, routers: Iterable[APIRouter]) -> None:
     """Refuse foreign Host headers (DNS rebinding), cross-origin writes, strangers and bodies over the limit."""
-    app.add_middleware(Guard, services=services)
+    app.add_middleware(Guard, services=services, access=AccessTable(routers))
+
+
+class Timed:
+    """A send that knows which status went out; 0 where none did."""
+
+    def __init__(self, send: Send) -> None:
+        self._send, self.status = send, 0
+
+    async def __call__(self, message: Message) -> None:
+        self.status = message.get("status", self.status)
+        await self._send(message)
 
 
 class Guard:
     """The middleware; plain ASGI, because Starlette's base class copies every request through a task of its own."""
 
-    def __init__(self, app: ASGIApp, services: Services) -> None:
-        self._app, self._services = app, services
+    def __init__(self, app: ASGIApp, services: Services, access: AccessTable) -> None:
+        self._app, self._services, self._access = app, services, access
         asked = services.settings
         self._failed = FailedKeys(
             per_address=RateLimitItemPerMinute(asked.failed_keys_per_minute),
@@ -55,34 +76,31 @@ class Guard:
         traces.note(traces.CORRELATION, correlation)
         with origin.bound(actor="", correlation=correlation):
             named = _with_headers(send, HEADERS | {CORRELATION: correlation})
-            await self._guarded(request, receive, self._timed(request, named))
-
-    def _timed(self, request: Request, send: Send) -> Send:
-        """Count the answer once it is sent."""
-        began, status = time.monotonic(), 0
-
-        async def sent(message: Message) -> None:
-            nonlocal status
-            status = message.get("status", status)
-            await send(message)
-            if message["type"] == "http.response.body" and not message.get("more_body", False):
-                self._services.answered.tell(request, status, time.monotonic() - began)
-
-        return sent
+            timed, began = Timed(named), time.monotonic()
+            try:
+                await self._guarded(request, receive, timed)
+            except Exception:  # answered outside of this, with 500, and logged there
+                timed.status = 500
+                raise
+            finally:
+                if timed.status:  # else who asked has gone
+                    self._services.answered.tell(request, timed.status, time.monotonic() - began)
 
     async def _guarded(self, request: Request, receive: Receive, send: Send) -> None:
         limit = _largest_body(request, self._services.settings)
+        counted = request.url.path != DATA_PATH
         try:
             _check_host(request, self._services.settings)
             _check_origin(request)
             _check_size(request, limit)
             await self._admit(request)
+            self._access.check(request)
         except ServiceError as error:
             await problems.refusal(request, error)(request.scope, receive, send)
         except problems.OUTAGES as error:
             await problems.outage(request, error)(request.scope, receive, send)
         else:
-            await self._app(request.scope, _bounded(receive, limit), send)
+            await self._app(request.scope, _bounded(receive, limit, counted=counted), send)
 
     async def _admit(self, request: Request) -> None:
         """Say who asks, for handlers, events and logs. Raises Unauthenticated, TooManyFailedKeys."""
@@ -94,7 +112,8 @@ class Guard:
 
     async def _caller(self, request: Request) -> Caller:
         shown = request.headers.get("authorization")
-        if shown is None and self._services.settings.embedded and _is_local(request):
+        settings = self._services.settings
+        if shown is None and settings.embedded and settings.keyless and _is_local(request):
             return ON_THIS_MACHINE
         scheme, _, secret = (shown or "").partition(" ")
         if scheme.lower() != "bearer" or not secret.strip():
@@ -103,13 +122,16 @@ class Guard:
 
     def _verified(self, secret: str, host: str) -> Caller:
         claimed = keys.named_by(secret)
-        self._failed.check(host, claimed)
+        if not self._failed.is_good(secret):
+            self._failed.check(host, claimed)
         try:
             with self._services.database.read() as session:
-                return Caller.of(keys.verify(session, secret, self._services.clock()))
+                found = Caller.of(keys.verify(session, secret, self._services.clock()))
         except Unauthenticated:
             self._failed.count(host, claimed)
             raise
+        self._failed.vouch(secret)
+        return found
 
 
 def _correlation(request: Request) -> str:
@@ -134,7 +156,7 @@ def _with_headers(send: Send, headers: dict[str, str]) -> Send:
 
 def _largest_body(request: Request, settings: Settings) -> int:
     """Parsed JSON takes twenty times its bytes and more, so only bodies that bring data may be long."""
-    if request.method == "POST" and request.url.path == "/trajectories":
+    if request.url.path == DATA_PATH:
         return settings.max_body_bytes
     own = settings.max_labels_bytes if request.url.path == "/labels" else settings.max_json_bytes
     return min(own, settings.max_body_bytes)
@@ -160,19 +182,31 @@ def _check_size(request: Request, limit: int) -> None:
         raise BodyTooLarge(f"content-length: {length} bytes, {limit} are allowed")
 
 
-def _bounded(receive: Receive, limit: int) -> Receive:
-    """A chunked body says no length: count it. FastAPI lets only its own exception through while it reads a body."""
-    total = 0
+def _bounded(receive: Receive, limit: int, *, counted: bool) -> Receive:
+    """A chunked body says no length: count it. FastAPI lets only its own exception through while it reads a body.
 
-    async def counted() -> Message:
-        nonlocal total
+    counted: count what JSON of it would be made into, too, before anybody makes it.
+    """
+    total, values, containers = 0, 0, 0
+
+    async def read() -> Message:
+        nonlocal total, values, containers
         message = await receive()
-        total += len(message.get("body", b""))
-        if total > limit:
-            raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"body: {total} bytes, {limit} are allowed")
+        body = message.get("body", b"")
+        total += len(body)
+        if counted:
+            values += body.count(b",")
+            containers += body.count(b"[") + body.count(b"{")
+        for found, most, what in (
+            (total, limit, "bytes"),
+            (values, MOST_VALUES, "values"),
+            (containers, MOST_CONTAINERS, "lists and objects"),
+        ):
+            if found > most:
+                raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"body: {found} {what}, {most} are allowed")
         return message
 
-    return counted
+    return read
 
 
 def _is_local(request: Request) -> bool:

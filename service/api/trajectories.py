@@ -54,7 +54,7 @@ def add_trajectories(
     # Blobs first: they are named by content, so a crash before the rows leaves nothing wrong behind.
     named = [(file.filename or "file", file.file) for file in files]
     arrays = streams.read(spaces, named, held.settings.max_body_bytes)
-    stored = [pool.store(held.blobs, spaces, each, name) for (name, _), each in zip(named, arrays, strict=True)]
+    stored = [pool.write(held.blobs, spaces, each, name) for (name, _), each in zip(named, arrays, strict=True)]
     with held.database.write() as session:
         pool.keep(session, stored, now)
         row = projects.find(session, project, lock=True)

@@ -8,6 +8,7 @@ Settings), so that keys are in no URL and no log.
 """
 
 import hashlib
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ log = get_logger("store")
 RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=10)}
 
 
+NAME = re.compile(r"(?P<kind>[a-z]+)/[0-9a-f]{2}/(?P<sha256>[0-9a-f]{64})$")
 TRASH = "trash"  # first part of the key of what was discarded
 
 
@@ -148,8 +150,9 @@ class Blobs:
         with _reached(prefix):
             for chunk in self._store.list(prefix):
                 for found in chunk:
-                    kind, _, sha256 = found["path"].split("/")[-3:]
-                    yield Stored(kind, sha256, found["size"], found["last_modified"])
+                    named = NAME.search(found["path"])
+                    if named:  # else somebody put it there
+                        yield Stored(named["kind"], named["sha256"], found["size"], found["last_modified"])
 
     def _mend(self, kind: str, sha256: str, data: bytes) -> None:
         """An object of this name may be torn (a crash of an older store, a bad disk): write it again if it is."""

@@ -5,16 +5,18 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy import Connection, Engine, create_engine, event, make_url
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
+from service.errors import NoDatabase
 from service.settings import POOL_SIZE
 from service.store.queries.events import keep_order
 
@@ -84,6 +86,34 @@ def _alembic() -> Config:
     config.set_main_option("script_location", "service.store:migrations")
     config.set_main_option("path_separator", "os")
     return config
+
+
+def downgrade(url: str, revision: str) -> None:
+    """Take the schema back to `revision`."""
+    config = _alembic()
+    config.attributes["url"] = url
+    command.downgrade(config, revision)
+
+
+def check_newest(url: str) -> None:
+    """Raises NoDatabase where it is missing (to open a SQLite file would make it) or of another schema."""
+    named = make_url(url)
+    if named.get_backend_name() == "sqlite" and not Path(str(named.database)).exists():
+        raise NoDatabase(named.render_as_string(), "is not there")
+    database = open_database(url, pool_size=1)
+    try:
+        with database.engine.connect() as connection:
+            found = revision_of(connection)
+    finally:
+        database.close()
+    if found != newest_revision():
+        reason = f"has schema {found or 'none'}, this version of asim needs {newest_revision()}: asim db upgrade"
+        raise NoDatabase(named.render_as_string(), reason)
+
+
+def knows(revision: str) -> bool:
+    """Whether there is such a migration."""
+    return revision in {each.revision for each in ScriptDirectory.from_config(_alembic()).walk_revisions()}
 
 
 def revision_of(connection: Connection) -> str:

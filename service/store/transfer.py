@@ -5,7 +5,7 @@ transaction.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from datetime import datetime
 from itertools import islice
@@ -20,7 +20,7 @@ from sqlalchemy.orm import Session
 import service.store.tables  # noqa: F401  # its rows are what the metadata holds
 from service.errors import NotEmpty, UnreadableBackup
 from service.store.columns import Row
-from service.store.database import migrate, open_database
+from service.store.database import check_newest, downgrade, knows, migrate, open_database, revision_of
 from service.store.queries.events import keep_order
 
 BATCH = 1000  # rows written at once
@@ -51,24 +51,36 @@ def dump(connection: Connection, folder: Path) -> dict[str, int]:
     return counts
 
 
-def load(folder: Path, url: str, revision: str) -> None:
+def load(folder: Path, url: str, revision: str, counts: Mapping[str, int]) -> None:
     """Files of that schema into an empty database, which is then brought up to date.
 
-    Raises NotEmpty, and UnreadableBackup where a file is not what `dump` wrote.
+    counts: rows by table. Raises NotEmpty, and UnreadableBackup where a file is not what `dump` wrote.
     """
-    migrate(url, revision)
+    _bring_to(url, revision)
     with _written(url) as (connection, tables):
-        for name, table in tables.items():
-            path = folder / f"{name}{SUFFIX}"
-            if path.exists():
-                columns, rows = _read(path)
-                _write(connection, table, columns, rows)
+        for name in (name for name in tables if name in counts):
+            columns, rows = _read(folder / f"{name}{SUFFIX}")
+            written = _write(connection, tables[name], columns, rows)
+            if written != counts[name]:
+                raise UnreadableBackup(name, f"has {written} rows, its manifest tells of {counts[name]}")
     migrate(url)
 
 
+def _bring_to(url: str, revision: str) -> None:
+    """An empty database to the schema that the rows are of, so that its migrations move them. Raises NotEmpty."""
+    if not knows(revision):
+        raise UnreadableBackup(revision, "is a schema of a newer version of asim")
+    migrate(url, revision)
+    with closing(open_database(url, pool_size=1)) as database, database.engine.connect() as connection:
+        _check_empty(connection)
+        found = revision_of(connection)
+    if found != revision:  # it was newer
+        downgrade(url, revision)
+
+
 def copy(source: str, target: str) -> dict[str, int]:
-    """All rows of one database into another, empty one; rows by table. Raises NotEmpty."""
-    migrate(source)
+    """All rows of one database into another, empty one; rows by table. Raises NotEmpty, NoDatabase."""
+    check_newest(source)
     migrate(target)
     counts = {}
     with snapshot(source) as reading, _written(target) as (writing, _):

@@ -18,7 +18,8 @@ ROOT = Path(__file__).parents[2]
 FILE = ROOT / "docker-compose.yml"
 SCRIPT = ROOT / "docker" / "make-secrets"
 OURS = ("service", "scheduler", "trainer", "scorer", "labeler")
-MOUNTS = ("/data", "/blobs", "/provenance", "/run/secrets")
+SECRETS = "/run/secrets"
+MOUNTS = ("/data", "/blobs", "/provenance", SECRETS)
 Json = dict[str, Any]
 
 
@@ -57,7 +58,7 @@ class Machine:
         for mount in MOUNTS:
             self.path(mount).mkdir(parents=True)
         for name, content in secrets.items():
-            (self.path("/run/secrets") / name).write_text(content)
+            (self.path(SECRETS) / name).write_text(content)
 
     def path(self, inside: str) -> Path:
         """What a container finds there."""
@@ -74,7 +75,7 @@ class Machine:
 
     def environment(self, name: str) -> dict[str, str]:
         """A service's variables; a path that it does not mount is not there for it."""
-        mounted = {volume.split(":")[1] for volume in service(name).get("volumes", [])} | {"/run/secrets"}
+        mounted = {volume.split(":")[1] for volume in service(name).get("volumes", [])}
         given: dict[str, str] = service(name)["environment"]
         return {key: self._mapped(value, mounted, name) for key, value in given.items()}
 
@@ -83,7 +84,17 @@ class Machine:
         """Where the API listens."""
         return f"http://127.0.0.1:{self.port}"
 
+    def _declared(self, name: str) -> Path:
+        """A folder with the secrets that the service declares, and no others."""
+        folder = self.folder / f"secrets-of-{name}"
+        folder.mkdir(exist_ok=True)
+        for secret in service(name).get("secrets", []):
+            shutil.copy(self.path(SECRETS) / secret, folder)
+        return folder
+
     def _mapped(self, value: str, mounted: set[str], name: str) -> str:
+        if value == SECRETS:
+            return str(self._declared(name))
         if value not in MOUNTS:
             return value
         if value in mounted:

@@ -1,6 +1,8 @@
 """Uploads that must be refused, drawn by a seed: eight kinds of them, each with words for its fault."""
 
+import base64
 import io
+import json
 import struct
 import zipfile
 from collections.abc import Callable, Iterator
@@ -47,7 +49,7 @@ def malformed(seed: int, count: int) -> Iterator[Malformed]:
         huge_header,
         zip_bomb,
         path_in_a_name,
-        deep_json,
+        nested_json,
     )
     for number in range(count):
         yield kinds[number % len(kinds)](rng)
@@ -110,6 +112,28 @@ def path_in_a_name(rng: np.random.Generator) -> Malformed:
     return Malformed("path in a name", _zipped(members), ("streams", "whole npz"))
 
 
+def nested_json(rng: np.random.Generator) -> Malformed:
+    """Deep or wide: few bytes of which a parser, or who names each fault, makes much."""
+    return (deep_json if rng.random() < 0.5 else wide_json)(rng)
+
+
+def wide_json(rng: np.random.Generator) -> Malformed:
+    """Many fields that nobody knows, many wrong values in one list, many lists of nothing."""
+    many = int(10 ** rng.uniform(3, 5.5))
+    path = str(rng.choice(["/labels", "/acquire", "/projects"]))
+    fields = {f"field{number}": 0 for number in range(many)}
+    content = base64.b64encode(npz(room(0))).decode()
+    bodies = (
+        fields,
+        {"project": "PROJECT", "count": 1, "items": [fields]},
+        {"project": "PROJECT", "trajectories": [{"content": content, "actions": ["x"] * many}]},
+        {"name": "n", "environment": {"spaces": {"observations": {"a": {"dtype": "uint8", "high": [""] * many}}}}},
+        {"project": "PROJECT", "items": [[]] * many},
+    )
+    words = ("fields", "should", "required", "permitted", "number", "content-length", "body", "many", "at most")
+    return Malformed("nested JSON", json.dumps(bodies[int(rng.integers(len(bodies)))]).encode(), words, path=path)
+
+
 def deep_json(rng: np.random.Generator) -> Malformed:
     """Nothing, many times nested: closed or not, alone or as a field."""
     depth, opening, closing = int(10 ** rng.uniform(2.5, 6)), *[(b"[", b"]"), (b'{"a":', b"}")][int(rng.integers(2))]
@@ -117,7 +141,7 @@ def deep_json(rng: np.random.Generator) -> Malformed:
     field = b'{"project": "PROJECT", "items": ' + inner + b"}"
     path = str(rng.choice(["/labels", "/acquire", "/projects"]))
     words = ("body", "JSON", "items", "Field required", "content-length")
-    return Malformed("deep JSON", field if rng.random() < 0.5 else inner, words, path=path)
+    return Malformed("nested JSON", field if rng.random() < 0.5 else inner, words, path=path)
 
 
 def _too_large(rng: np.random.Generator) -> Malformed:

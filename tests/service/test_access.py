@@ -1,19 +1,23 @@
 """What each key reaches, asked of every endpoint; and keys that are limited, have expired, or failed too often."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Mapping
 from datetime import timedelta
 
 import pytest
+from fastapi.testclient import TestClient
 from limits import RateLimitItemPerSecond
+from starlette.types import Message
 
+from service import keys
 from service.api.attempts import FailedKeys
 from service.errors import TooManyFailedKeys
-from tests.service.access_table import DOCUMENT, Things, ask, endpoints, fill, holder, stranger, table
+from tests.service.access_table import DOCUMENT, ELSEWHERE, Things, ask, endpoints, fill, holder, stranger, table
 from tests.service.conftest import Serve
 from tests.service.kit import UNKNOWN, Served, refused
 
 OPEN = {"/health/live", "/health/ready"}
+HERE = ("127.0.0.1", 50000)
 
 
 def test_the_document_tells_what_every_endpoint_answers_to_every_key(served: Served) -> None:
@@ -109,20 +113,56 @@ def test_keys_are_listed_without_their_secrets(served: Served) -> None:
     assert not any(each["secret"] in json.dumps(listed) for each in made)
 
 
-def test_a_stranger_is_refused_before_the_body_is_read(served: Served) -> None:
-    sent = 0
-
-    def body() -> Iterator[bytes]:
-        nonlocal sent
-        for _ in range(100):
-            sent += 1
-            yield b" " * 1000
-
-    answer = stranger(served).post("/labels", content=body(), headers={"Content-Type": "application/json"})
-    refused(answer, 401, "unauthenticated", "Bearer")
+@pytest.mark.parametrize("path", ["/labels", "/trajectories", "/projects", "/acquire"])
+def test_nothing_is_read_of_a_body_that_its_sender_may_not_send(served: Served, path: str) -> None:
+    """Neither a stranger's, nor of somebody whose key has another scope, or is of one project where all are meant."""
+    project = served.project()
+    for headers, status in (({}, 401), (holder(served, "read"), 403), (holder(served, "read", project=project), 403)):
+        assert bodies_read(served, path, headers) == (status, 0)
+    status, read = bodies_read(served, path, holder(served, "admin"))
+    assert status not in (401, 403)
+    assert read > 0
 
 
-@pytest.mark.parametrize("header", ["X-Forwarded-For", "Forwarded", "X-Real-IP"])
+def bodies_read(served: Served, path: str, headers: Mapping[str, str]) -> tuple[int, int]:
+    """The status, and how often the service asked for more of the body of a POST."""
+    asked, statuses = 0, list[int]()
+
+    async def receive() -> Message:
+        nonlocal asked
+        asked += 1
+        return {"type": "http.request", "body": b" " * 1000, "more_body": asked < 5}
+
+    async def send(message: Message) -> None:
+        statuses.extend([message["status"]] if "status" in message else [])
+
+    kind = "multipart/form-data; boundary=x" if path == "/trajectories" else "application/json"
+    told = {"host": "127.0.0.1", "content-type": kind, **headers}
+    scope = {"type": "http", "method": "POST", "path": path, "raw_path": path.encode(), "query_string": b""}
+    scope |= {"headers": [(name.lower().encode(), value.encode()) for name, value in told.items()]}
+    scope |= {"client": ELSEWHERE, "server": ("127.0.0.1", 8000), "scheme": "http", "http_version": "1.1"}
+    served.client.portal.call(served.app, scope, receive, send)  # type: ignore[union-attr]  # kit.serve opens it
+    return statuses[0], asked
+
+
+def test_an_answer_that_the_service_failed_to_give_is_counted(start: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    served = start()
+    holder(served, "read")
+    monkeypatch.setattr(keys, "describe", None)
+    client = TestClient(served.app, base_url="http://127.0.0.1", client=HERE, raise_server_exceptions=False)
+    assert client.get("/keys").status_code == 500
+    assert 'asim_requests_total{method="GET",route="/keys",status="500"} 1.0' in served.client.get("/metrics").text
+
+
+def test_keyless_asking_can_be_turned_off(start: Serve) -> None:
+    served = start()
+    headers = holder(served, "read")
+    served = start(keyless=False)
+    refused(served.client.get("/projects"), 401, "unauthenticated")
+    assert served.client.get("/projects", headers=headers).status_code == 200
+
+
+@pytest.mark.parametrize("header", ["X-Forwarded-For", "Forwarded", "X-Real-IP", "Via", "X-Forwarded-Proto"])
 def test_a_proxy_on_this_machine_opens_nothing_to_those_behind_it(served: Served, header: str) -> None:
     refused(served.client.get("/projects", headers={header: "192.0.2.7"}), 401, "unauthenticated")
     assert served.client.get("/projects", headers={header: "192.0.2.7"} | holder(served, "read")).status_code == 200
@@ -148,8 +188,10 @@ def test_a_key_that_fails_again_and_again_is_not_looked_up_any_more(start: Serve
     for number in range(90):
         made_up = {"Authorization": f"Bearer asim_{number:032x}_x"}
         refused(client.get("/projects", headers=made_up), 401, "unauthenticated")
-    refused(client.get("/projects", headers=good), 429, "too-many-failed-keys", "100 keys")
-    assert served.client.get("/projects", headers=good).status_code == 200  # another machine
+    assert client.get("/projects", headers=good).status_code == 200  # it opened something before they failed
+    new = holder(served, "read")
+    refused(client.get("/projects", headers=new), 429, "too-many-failed-keys", "100 keys")
+    assert served.client.get("/projects", headers=new).status_code == 200  # another machine
     assert served.client.get("/projects").status_code == 200
 
 

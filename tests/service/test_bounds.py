@@ -2,6 +2,7 @@
 
 import base64
 import io
+import warnings
 import zipfile
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 from api_schemas.labels import MOST_SEGMENTS
 from tests.service.conftest import Serve
-from tests.service.kit import MAX_BODY_BYTES, UNKNOWN, Json, Served, npz, refused
+from tests.service.kit import MAX_BODY_BYTES, ROBOT, UNKNOWN, Json, Served, npz, refused, robot
 
 POINT: Json = {
     "spaces": {
@@ -109,8 +110,58 @@ def test_files_of_one_request_share_what_they_may_unpack_to(served: Served) -> N
 
 def test_a_file_has_so_many_members_and_no_more(served: Served) -> None:
     project = served.project(environment=POINT)
-    many = npz({f"point{number}": np.zeros((2, 1), np.uint8) for number in range(257)})
-    refused(served.send(project, [("many.npz", many)]), 400, "foreign-file", "many.npz", 257, 256)
+    many = npz({f"point{number}": np.zeros((2, 1), np.uint8) for number in range(67)})
+    refused(served.send(project, [("many.npz", many)]), 400, "foreign-file", "many.npz", 67, 66)
+
+
+def test_a_file_names_a_stream_once(served: Served) -> None:
+    project, buffer = served.project(environment=POINT), io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # zipfile's, of the name that comes twice
+        for number in range(2):
+            content = io.BytesIO()
+            np.save(content, np.full((2, 1), number, np.uint8))
+            archive.writestr("point.npy", content.getvalue())
+    refused(
+        served.send(project, [("twice.npz", buffer.getvalue())]), 400, "foreign-file", "twice.npz", "twice: ['point"
+    )
+
+
+def test_one_bad_file_of_a_request_leaves_no_blob_of_the_others(served: Served) -> None:
+    project, blobs = served.project(environment=ROBOT), served.settings.data_folder / "blobs"
+    good, bad = robot(0), robot(1)
+    bad["proprioception"][3, 2] = np.nan
+    refused(
+        served.send(project, [("0.npz", npz(good)), ("1.npz", npz(bad))]), 422, "invalid-trajectory", "1.npz", "nan"
+    )
+    assert not [path for path in blobs.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize(
+    "told", ["[" * 20_000, '["0001-01-01T00:00:00+14:00", "x"]', f"[{2**70}, 1]", "{}", "[[], []]"]
+)
+def test_a_cursor_of_ones_own_is_refused(on_both: Served, told: str) -> None:
+    cursor = base64.urlsafe_b64encode(told.encode()).decode()
+    for path in ("/keys", "/projects", "/events"):
+        refused(on_both.client.get(path, params={"cursor": cursor}), 422, "invalid-field", "cursor")
+
+
+@pytest.mark.parametrize("when", ["9999-12-31T23:59:59-10:00", "0001-01-01T00:00:00+14:00"])
+def test_a_time_has_one_in_utc(served: Served, when: str) -> None:
+    body = {"name": "ada", "scopes": ["read"], "expires_at": when}
+    refused(served.client.post("/keys", json=body), 422, "malformed-request", "expires_at", "UTC")
+
+
+def test_a_body_of_many_lists_is_refused_before_they_are_made(served: Served) -> None:
+    body = b'{"items": [' + b"[]," * 1_000_001 + b"[]]}"
+    answer = served.client.post("/labels", content=body, headers={"Content-Type": "application/json"})
+    refused(answer, 413, "body-too-large", "lists and objects", 1_000_000)
+
+
+def test_a_stream_is_not_named_as_files_name_something_else(served: Served) -> None:
+    spaces = {"observations": {"__metadata__": {"dtype": "uint8", "shape": [1]}}, "actions": POINT["spaces"]["actions"]}
+    answer = served.client.post("/projects", json={"name": "x", "environment": {"spaces": spaces}})
+    refused(answer, 422, "malformed-request", "__metadata__")
 
 
 def test_a_list_of_wrong_values_is_refused_by_its_first(served: Served) -> None:
@@ -122,10 +173,15 @@ def test_a_list_of_wrong_values_is_refused_by_its_first(served: Served) -> None:
 
 
 def test_a_refusal_shows_so_many_fields_and_so_much_of_each(served: Served) -> None:
-    body = {f"field{number}": "x" * 5000 for number in range(500)}
-    problem = refused(served.client.post("/projects", json=body), 422, "malformed-request")
+    few = {f"field{number}": "x" * 5000 for number in range(25)}
+    problem = refused(served.client.post("/projects", json=few), 422, "malformed-request", "name", "field0")
     assert len(problem["invalid_params"]) == 20
     assert max(len(param["value"]) for param in problem["invalid_params"]) == 200
+    many = {f"field{number}": 0 for number in range(10_000)}
+    problem = refused(
+        served.client.post("/projects", json=many), 422, "malformed-request", "has 10000 fields, 8 are known"
+    )
+    assert len(problem["detail"]) < 1000
 
 
 def test_a_body_that_brings_no_data_is_short(served: Served) -> None:

@@ -9,6 +9,7 @@ import pytest
 from sqlalchemy import text, update
 from sqlalchemy.orm import Session
 
+from asim import doctor
 from asim.doctor import examine, report
 from service import canary, jobs
 from service.settings import Settings
@@ -47,7 +48,7 @@ def _serve_queues(session: Session, now: datetime) -> None:
 def told(served: Served, later: timedelta = timedelta(), **settings: object) -> str:
     """All that is wrong, in words."""
     asked = served.settings.model_copy(update=settings)
-    found = list(examine(asked, served.clock.now + later))
+    found = list(examine(asked, lambda: served.clock.now + later))
     return "\n".join(line for line in report(found) if not line.startswith("ok "))
 
 
@@ -67,6 +68,38 @@ def test_a_fault_is_told_with_what_to_do_and_ends_with_status_1(
     assert f"FAULT  disk: {folder} has " in printed
     assert "       make room" in printed
     assert "ok     keys" in printed
+
+
+def test_a_blob_in_the_trash_and_a_strangers_file_are_no_faults(well: Served) -> None:
+    blobs = well.services.blobs
+    for blob in list(blobs.stored()):
+        blobs.discard(blob.kind, blob.sha256)
+    (well.settings.data_folder / "blobs" / "weights" / "README").write_text("put here by somebody")
+    assert told(well) == ""
+    assert not list(blobs.stored())
+
+
+def test_a_check_that_breaks_down_is_a_fault_and_the_others_go_on(
+    well: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(doctor.THEN, "queues", lambda held: iter([1 / 0]))
+    words = told(well, later=HOUR * 24 * 400)
+    assert "FAULT  queues: the check broke down: ZeroDivisionError" in words
+
+
+def test_the_time_that_another_check_takes_is_no_fault_of_the_clock(
+    well: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A broker that does not answer takes seconds to say so, and workers go on meanwhile."""
+
+    def slow(_: doctor.Installation) -> Iterator[doctor.Fault]:
+        well.clock.now += timedelta(seconds=5)
+        with well.services.database.write() as session:
+            jobs.worker_alive(session, "ada:1", canary.QUEUES, well.clock.now)
+        yield from ()
+
+    monkeypatch.setitem(doctor.FIRST, "broker", slow)
+    assert told(well) == ""
 
 
 def test_a_folder_that_everybody_reaches_into(well: Served) -> None:

@@ -58,7 +58,7 @@ def test_a_labeled_trajectory_may_be_held_out(served: Served) -> None:
         (room(1), {"actions": [0, 0, 9, 0, 0]}, 422, "invalid-label", ["trajectories[1].actions[2]", 9]),
         (room(1), {"starts": [5]}, 422, "invalid-label", ["start", 5]),
         (room(1), {"starts": [-1]}, 422, "invalid-label", ["start", -1]),
-        (room(1), {"starts": [10**30]}, 422, "invalid-label", ["start", 10**30]),
+        (room(1), {"starts": [10**15]}, 422, "invalid-label", ["start", 10**15]),
         (room(1), {"action_sets": [[0]]}, 422, "invalid-label", ["action_sets", 1]),
         (room(1), {"content": "AAAA"}, 400, "foreign-file", ["trajectories[1].content"]),
         (room(1), {"content": "A"}, 422, "malformed-request", ["trajectories.1.content"]),

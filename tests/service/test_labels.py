@@ -76,11 +76,11 @@ def test_a_free_segment_needs_no_lease(served: Served) -> None:
     [
         ({"actions": [7]}, ["actions[0]", "0 to 6", 7]),
         ({"actions": [-1]}, ["actions[0]", -1]),
-        ({"actions": [10**30]}, ["actions[0]", 10**30]),
+        ({"actions": [10**15]}, ["actions[0]", 10**15]),
         ({"actions": [[0.5]]}, ["actions[0]", "[0.5]"]),
         ({"actions": [1, 2]}, ["length", "must be 1", 2]),
         ({"start": 5}, ["start", "up to 4", 5]),
-        ({"start": 10**30}, ["start", 10**30]),
+        ({"start": 10**15}, ["start", 10**15]),
         ({"action_sets": [[0], [1]]}, ["action_sets", "must be 1", 2]),
         ({"action_sets": [[1, 2]]}, ["action_sets[0]", "must hold the action 0"]),
         ({"action_sets": [[0, 7]]}, ["action_sets[0]", 7]),
@@ -96,7 +96,7 @@ def test_one_label_that_does_not_fit_leaves_nothing_of_ten(served: Served, chang
     assert stored(served, project) == []
 
 
-@pytest.mark.parametrize("action", ["true", "1.0", "1.5", '"1"', "null", "[]", "{}"])
+@pytest.mark.parametrize("action", ["true", "1.5", "1e30", '"1"', "null", "[]", "{}"])
 def test_a_discrete_action_is_an_integer_and_nothing_like_it(served: Served, action: str) -> None:
     project = filled(served)
     item = free(served, project)[0]

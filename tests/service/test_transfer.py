@@ -1,23 +1,25 @@
 """Rows in files and in another database are the rows that were there, and the service goes on with them."""
 
 import json
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 import zstandard
 from sqlalchemy import func, select
 
-from service.backup import MANIFEST, backup, read_manifest, restore
-from service.errors import BackupExists, NotEmpty, UnreadableBackup
+from service.backup import MANIFEST, Manifest, TableFile, backup, read_manifest, restore
+from service.errors import BackupExists, NoDatabase, NotEmpty, UnreadableBackup
 from service.settings import Settings
 from service.store import transfer
 from service.store.blobs import Blobs
-from service.store.database import migrate, open_database
+from service.store.database import downgrade, migrate, newest_revision, open_database, revision_of
 from service.store.provenance import ProvenanceBlobs
-from service.store.tables import EventEpochRow, EventRow, MembershipRow
+from service.store.tables import EventEpochRow, EventRow, KeyRow, MembershipRow
 from tests.servers import postgres_database
 from tests.service.access_table import fill
 from tests.service.kit import Served, answers, room, serve
@@ -175,6 +177,73 @@ def test_a_damaged_backup_is_refused_before_any_row_is_written(filled: Served, t
     assert "no_such_column" in refusal(manifest, json.dumps(told).encode())
     assert all(rows == [] for rows in rows_of(target).values())
     assert read_manifest(made).tables["label"].rows > 0
+
+
+def test_an_interrupted_backup_leaves_nothing_that_the_next_could_trip_over(
+    filled: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as broken:
+        broken.setattr(transfer, "dump", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            backup(url_of(filled), own_stores(filled), tmp_path / "backup", filled.clock())
+    assert [path.name for path in tmp_path.iterdir()] == ["source"]
+    made = backup(url_of(filled), own_stores(filled), tmp_path / "backup", filled.clock())
+    assert (tmp_path / "backup").stat().st_mode & 0o077 == 0  # keys' hashes and tokens are in it
+    assert restore(tmp_path / "backup", f"sqlite:///{tmp_path / 'target.db'}", stores(tmp_path / "data")) == made
+
+
+def test_rows_of_an_older_schema_go_through_its_migrations_though_the_database_is_newer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, tables = f"sqlite:///{tmp_path / 'target.db'}", tmp_path / "backup" / "tables"
+    tables.mkdir(parents=True)
+    columns = ["id", "name", "secret_sha256", "scopes", "created_at"]  # 0009 brought two more
+    row = [str(uuid4()), "ada", "0" * 64, ["read"], "2026-01-01T00:00:00+00:00"]
+    rows = zstandard.compress(f"{json.dumps(columns)}\n{json.dumps(row)}\n".encode())
+    (tables / f"api_key{transfer.SUFFIX}").write_bytes(rows)
+    told = Manifest(
+        version="0.1.0",
+        revision="0008",
+        created_at=datetime.now(UTC),
+        tables={"api_key": TableFile(rows=1, sha256=_sha256(rows))},
+        blobs={},
+        missing=[],
+    )
+    (tmp_path / "backup" / MANIFEST).write_text(told.model_dump_json())
+    migrate(target)
+    passed: list[str] = []
+    monkeypatch.setattr(transfer, "migrate", _noting(passed, migrate))
+    monkeypatch.setattr(transfer, "downgrade", _noting(passed, downgrade))
+    restore(tmp_path / "backup", target, [])
+    assert passed == ["0008", "0008", "head"]
+    with closing(open_database(target)) as database, database.read() as session:
+        assert session.scalar(select(KeyRow.name)) == "ada"
+        assert revision_of(session.connection()) == newest_revision()
+
+
+def _noting(passed: list[str], real: Callable[..., None]) -> Callable[..., None]:
+    def noted(url: str, revision: str = "head") -> None:
+        passed.append(revision)
+        real(url, revision)
+
+    return noted
+
+
+def test_rows_of_a_newer_version_are_refused(filled: Served, tmp_path: Path) -> None:
+    backup(url_of(filled), own_stores(filled), tmp_path / "backup", filled.clock())
+    manifest = tmp_path / "backup" / MANIFEST
+    manifest.write_text(json.dumps(json.loads(manifest.read_bytes()) | {"revision": "9999"}))
+    with pytest.raises(UnreadableBackup, match="9999 is a schema of a newer version"):
+        restore(tmp_path / "backup", f"sqlite:///{tmp_path / 'target.db'}", stores(tmp_path / "data"))
+
+
+def test_a_database_that_is_not_there_is_neither_copied_nor_made(tmp_path: Path) -> None:
+    missing, old, target = (f"sqlite:///{tmp_path / name}.db" for name in ("missing", "old", "target"))
+    migrate(old, "0008")
+    for source, reason in ((missing, "is not there"), (old, "has schema 0008")):
+        with pytest.raises(NoDatabase, match=reason):
+            transfer.copy(source, target)
+    assert [path.name for path in tmp_path.glob("*.db")] == ["old.db"]
 
 
 def test_a_blob_that_is_missing_is_named_and_the_rest_is_in_the_backup(filled: Served, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import base64
 import binascii
 import json
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from typing import Any, TypeVar
 
 from sqlalchemy import BindParameter, ColumnElement, literal, select, tuple_
@@ -12,6 +13,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 from service.errors import InvalidField
 
 R = TypeVar("R")
+LONGEST = 1_000  # characters of a cursor
 
 
 def page(
@@ -43,8 +45,8 @@ def _encode(row: object, key: tuple[InstrumentedAttribute[Any], ...]) -> str:
 
 def _decode(cursor: str, length: int) -> list[Any]:
     try:
-        values = json.loads(base64.urlsafe_b64decode(cursor.encode()))
-    except (ValueError, binascii.Error) as error:
+        values = json.loads(base64.urlsafe_b64decode(cursor[:LONGEST].encode()))
+    except (ValueError, RecursionError, binascii.Error) as error:
         raise InvalidField("cursor", cursor, "is not one that this service gave out") from error
     if not isinstance(values, list) or len(values) != length:
         raise InvalidField("cursor", cursor, "is not one of this listing")
@@ -57,7 +59,9 @@ def _parse(column: InstrumentedAttribute[Any], value: Any) -> BindParameter[Any]
     try:
         if not isinstance(value, kind):
             value = kind.fromisoformat(value) if hasattr(kind, "fromisoformat") else kind(str(value))
-    except (TypeError, ValueError) as error:
+        if isinstance(value, datetime):
+            value = value.astimezone(UTC)
+    except (TypeError, ValueError, OverflowError) as error:
         raise InvalidField("cursor", value, "is not one of this listing") from error
     if isinstance(value, int) and abs(value) >= 2**63:  # more than a database's integer holds
         raise InvalidField("cursor", value, "is not one of this listing")
