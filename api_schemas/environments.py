@@ -161,9 +161,9 @@ def _robot_spaces(task: str, cameras: bool) -> Spaces:
 
 
 SIMULATOR_BEHAVIORS: dict[str, tuple[str, ...]] = {
-    "maniskill": ("random",),
+    "maniskill": ("expert", "random"),
     "minigrid": ("balanced", "expert", "mixture", "random"),
-    "robosuite": ("random",),
+    "robosuite": ("expert", "random"),
 }
 SIMULATOR_SPACES: dict[str, Callable[[Mapping[str, object]], Spaces]] = {
     "maniskill": maniskill_spaces,

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.simulators import robot_observation
+from workers.simulators import maniskill_experts, robot_observation
 from workers.simulators.base import (
     Action,
     Behavior,
@@ -24,6 +24,7 @@ from workers.simulators.robot_behaviors import RandomBehavior
 from workers.simulators.robot_observation import ACTION_SPACE, checked_action
 from workers.simulators.robot_options import RobotOptions
 from workers.simulators.robot_progress import Progress
+from workers.simulators.waypoints import ExpertBehavior
 
 NAME = "maniskill"
 HORIZONS = {name: task.horizon for name, task in TASKS.items()}
@@ -103,7 +104,10 @@ def make_simulator(options: Mapping[str, object]) -> Simulator:
     return ManiSkillSimulator(RobotOptions.parse(NAME, HORIZONS, options))
 
 
-_FACTORIES: dict[str, Callable[[], Behavior]] = {"random": RandomBehavior}
+_FACTORIES: dict[str, Callable[[], Behavior]] = {
+    "expert": lambda: ExpertBehavior(maniskill_experts.plan),
+    "random": RandomBehavior,
+}
 BEHAVIORS = tuple(_FACTORIES)
 
 

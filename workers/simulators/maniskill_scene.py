@@ -19,9 +19,15 @@ LINKS = {f"panda_link{number}": f"link{number}" for number in range(8)} | {
 HALF_TURN = (0.0, 0.0, 0.0, 1.0)  # about z: the two fingers are one mesh
 BLUE, RED, DARK_RED, WHITE = (0.05, 0.16, 0.63, 1), (1, 0, 0, 1), (0.69, 0.05, 0.05, 1), (1, 1, 1, 1)
 LIGHT_GREY, GREY, DARK_GREY = (0.9, 0.9, 0.92, 1), (0.72, 0.72, 0.76, 1), (0.25, 0.25, 0.27, 1)
-FRONT_EYE, FRONT_TARGET, FRONT_ANGLE = (0.75, 0.0, 0.5), (0.05, 0.0, 0.05), 50  # m, m, degrees
-WRIST_EYE, WRIST_ANGLE = (0.07, 0.0, 0.02), 75  # in the frame of the hand, which looks along its z
-FLOOR = 0.9  # m below the table's top
+FRONT = {  # the front camera's place and what it looks at, m: as near as the task's space allows
+    "PullCube": ((0.45, 0.0, 0.5), (-0.1, 0.0, 0.04)),
+    "PokeCube": ((0.8, 0.0, 0.6), (0.07, 0.0, 0.02)),
+    "LiftPegUpright": ((0.7, 0.0, 0.5), (0.05, 0.0, 0.07)),
+}
+FRONT_ANGLE = 45  # degrees
+WRIST = ((0.08, 0.0, 0.0), (0.035, 0.0, 0.12))  # likewise of the camera at the hand, in the hand's frame: z is ahead
+WRIST_ANGLE = 75
+FLOOR, WALLS = 0.9, 2.5  # m: below the table's top, and before and behind it
 RINGS = 5
 
 
@@ -30,7 +36,7 @@ def build_model(env: Any, task: str) -> Any:
     spec = mujoco.MjSpec()
     spec.meshdir = str(Path(str(load("mani_skill").__file__)).parent / MESHES)
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.45] * 3, [0.5] * 3
-    spec.visual.map.znear = 0.01
+    spec.stat.extent, spec.visual.map.znear = 1, 0.01  # m: the wrist's camera comes near to the table
     _add_table(spec)
     for mesh in sorted(set(LINKS.values())):
         spec.add_mesh(name=mesh, file=f"{mesh}.stl")
@@ -40,7 +46,7 @@ def build_model(env: Any, task: str) -> Any:
         body = spec.worldbody.add_body(name=link, mocap=True)
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, quat=turn, rgba=colour, **_seen(link))
     _OBJECTS[task](spec, env)
-    _add_cameras(spec)
+    _add_cameras(spec, task)
     return spec.compile()
 
 
@@ -64,22 +70,25 @@ def _add_table(spec: Any) -> None:
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **table, **_seen("table"))
     floor = {"size": [5, 5, 0.1], "pos": [0, 0, -FLOOR], "rgba": (0.45, 0.45, 0.48, 1)}
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, **floor, **_seen("floor"))
+    for name, place in (("back wall", -WALLS), ("front wall", WALLS)):  # else the sky is black
+        wall = {"size": [0.05, 5, 3], "pos": [place, 0, 0], "rgba": (0.6, 0.63, 0.68, 1)}
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **wall, **_seen(name))
     light = {"pos": [0, 0, 2], "dir": [0, 0, -1], "diffuse": [0.4] * 3}
     spec.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, **light)
 
 
-def _add_cameras(spec: Any) -> None:
-    eye, target = np.array(FRONT_EYE), np.array(FRONT_TARGET)
-    back = (eye - target) / np.linalg.norm(eye - target)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    spec.worldbody.add_camera(name="front", pos=eye, quat=_quaternion(right, back), fovy=FRONT_ANGLE)
-    wrist = _quaternion(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
-    spec.body("panda_hand").add_camera(name="wrist", pos=WRIST_EYE, quat=wrist, fovy=WRIST_ANGLE)
+def _add_cameras(spec: Any, task: str) -> None:
+    eye, target = map(np.array, FRONT[task])
+    turned = _quaternion(np.cross([0.0, 0.0, 1.0], eye - target), eye - target)
+    spec.worldbody.add_camera(name="front", pos=eye, quat=turned, fovy=FRONT_ANGLE)
+    eye, target = map(np.array, WRIST)
+    turned = _quaternion(np.array([0.0, 1.0, 0.0]), eye - target)
+    spec.body("panda_hand").add_camera(name="wrist", pos=eye, quat=turned, fovy=WRIST_ANGLE)
 
 
 def _quaternion(right: NDArray[np.float64], back: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4,) of a camera, from the directions of its x and z axes."""
-    right = right / np.linalg.norm(right)
+    """(4,) of a camera, from the directions of its x and z axes, which are at right angles."""
+    right, back = right / np.linalg.norm(right), back / np.linalg.norm(back)
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, np.column_stack([right, np.cross(back, right), back]).ravel())
     return quaternion

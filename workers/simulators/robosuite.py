@@ -7,13 +7,14 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.simulators import robot_observation
+from workers.simulators import robosuite_experts, robot_observation
 from workers.simulators.base import Action, Behavior, Observation, OptionError, Simulator, SimulatorError, State, Step
 from workers.simulators.robosuite_env import TASKS, make_env
 from workers.simulators.robot_behaviors import RandomBehavior
 from workers.simulators.robot_observation import ACTION_SPACE, checked_action
 from workers.simulators.robot_options import RobotOptions
 from workers.simulators.robot_progress import Progress
+from workers.simulators.waypoints import ExpertBehavior
 
 NAME = "robosuite"
 HORIZONS = {name: task.horizon for name, task in TASKS.items()}
@@ -93,7 +94,10 @@ def make_simulator(options: Mapping[str, object]) -> Simulator:
     return RobosuiteSimulator(RobotOptions.parse(NAME, HORIZONS, options))
 
 
-_FACTORIES: dict[str, Callable[[], Behavior]] = {"random": RandomBehavior}
+_FACTORIES: dict[str, Callable[[], Behavior]] = {
+    "expert": lambda: ExpertBehavior(robosuite_experts.plan),
+    "random": RandomBehavior,
+}
 BEHAVIORS = tuple(_FACTORIES)
 
 
