@@ -160,6 +160,7 @@ def test_simulators_beside_each_other_draw_what_they_draw_alone() -> None:
     third.reset(0)
     third.close()  # frees its own textures and no other's
     del third
+    second.close()  # and draws again all the same
     beside = first.observe(), second.observe()
     for one, other in zip(alone, beside, strict=True):
         assert all(np.array_equal(one[name], other[name]) for name in one)
@@ -186,6 +187,23 @@ def test_an_option_out_of_range_is_named_with_its_value(name: str, options: dict
 def test_an_unknown_behavior_is_named_beside_the_known_ones(robot: Simulator) -> None:
     with pytest.raises(OptionError, match=r"'clever'.*random"):
         make_behavior("clever", robot)
+
+
+@pytest.mark.parametrize("name", ["expert", "random"])
+def test_a_behavior_repeats_itself_and_leaves_the_simulator_alone(robot: Simulator, name: str) -> None:
+    runs = []
+    for _ in range(2):
+        behavior, rng = make_behavior(name, robot), np.random.default_rng(3)
+        robot.reset(4)
+        behavior.reset(rng)
+        actions = []
+        for _ in range(4):
+            before = robot.state()
+            actions.append(np.asarray(behavior.act(robot, rng)))
+            assert all(np.array_equal(before[key], array) for key, array in robot.state().items())
+            robot.step(actions[-1])
+        runs.append(np.stack(actions))
+    np.testing.assert_array_equal(runs[0], runs[1])
 
 
 def test_random_actions_fill_the_space_and_repeat_themselves(robot: Simulator) -> None:

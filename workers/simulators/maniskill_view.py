@@ -50,9 +50,9 @@ class View:
         return picture
 
     def close(self) -> None:
-        """Frees the renderer."""
+        """Frees the renderer; the next picture makes a new one."""
         if "_drawing" in vars(self):
-            self._drawing.close()
+            vars(self).pop("_drawing").close()
 
     @cached_property
     def _drawing(self) -> Any:

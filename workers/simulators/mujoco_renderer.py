@@ -1,5 +1,6 @@
 """Draws a MuJoCo scene from its cameras, fast in software: no shadows, reflections or antialiasing."""
 
+import atexit
 import weakref
 from collections.abc import Mapping
 from typing import Any
@@ -40,13 +41,14 @@ class SceneRenderer:
             self._window = mujoco.GLContext(size, size)
             self._window.make_current()
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        except (RuntimeError, ImportError, mujoco.FatalError) as error:
+        except (RuntimeError, mujoco.FatalError, load("OpenGL.error").Error) as error:
             raise SimulatorUnavailable(
                 f"MuJoCo cannot draw here ({error}). Run `{COMMAND}`, or unset MUJOCO_GL to draw in software."
             ) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._scene = mujoco.MjvScene(model, MAX_GEOMS)
-        self.close = weakref.finalize(self, _free, self._window, self._context)
+        self._free = weakref.finalize(self, _free, self._window, self._context)
+        atexit.register(self._free)  # before MuJoCo, at its own exit, ends what contexts live in
 
     def draw(self, data: Any, camera: str, size: int) -> NDArray[np.uint8]:
         """A new picture (size, size, 3) RGB. `data` is an MjData with current kinematics and cameras."""
@@ -61,6 +63,11 @@ class SceneRenderer:
         mujoco.mjr_render(rectangle, self._scene, self._context)
         mujoco.mjr_readPixels(picture, None, rectangle, self._context)
         return np.ascontiguousarray(picture[::-1])  # OpenGL begins below
+
+    def close(self) -> None:
+        """Frees the context; harmless when repeated."""
+        self._free()
+        atexit.unregister(self._free)
 
     def _option(self, camera: str) -> Any:
         if camera not in self._options:

@@ -63,9 +63,9 @@ class View:
         return self._renderer.draw(self._data, NAMES["front"], PICTURE_SIZE)
 
     def close(self) -> None:
-        """Frees the renderer."""
+        """Frees the renderer; the next picture makes a new one."""
         if "_renderer" in vars(self):
-            self._renderer.close()
+            vars(self).pop("_renderer").close()
 
     @cached_property
     def _renderer(self) -> SceneRenderer:

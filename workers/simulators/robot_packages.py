@@ -35,7 +35,8 @@ def load(name: str) -> ModuleType:
     try:
         with quiet():
             return import_module(name)
-    except (ImportError, OSError, AttributeError) as error:  # PyOpenGL meets a missing libOSMesa as an AttributeError
+    # PyOpenGL meets a missing libOSMesa as an AttributeError, MuJoCo an unknown MUJOCO_GL as a RuntimeError.
+    except (ImportError, OSError, AttributeError, RuntimeError) as error:
         raise SimulatorUnavailable(
             f"Package {name.partition('.')[0]!r} cannot be imported ({error}). Run `{COMMAND}` in the environment of "
             "this process: it installs the robot simulators and the libraries that they draw with."
