@@ -6,8 +6,8 @@ export PYTHONSAFEPATH := 1
 SEED ?= 0
 REPEAT ?= 50
 
-.PHONY: help setup system demo serve test test-slow audit lint types imports format bench-acquire bench-score bench-paper-minigrid \
-	bench-paper-minigrid-full clean
+.PHONY: help setup setup-robots system demo serve test test-slow test-robots audit lint types imports format bench-acquire \
+	bench-score bench-simulators bench-paper-minigrid bench-paper-minigrid-full clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -22,6 +22,15 @@ $(VENV)/.installed: pyproject.toml constraints.txt scripts/system-packages
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	touch $@
 
+setup-robots: $(VENV)/.robots ## what the robot simulators need besides
+
+# The simulators themselves come without their dependencies: what they import for our tasks is in the two groups.
+$(VENV)/.robots: $(VENV)/.installed
+	scripts/system-packages robots
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[robosuite,maniskill]'
+	$(BIN)/python -m pip install --quiet --no-deps -c constraints.txt robosuite mani-skill sapien
+	touch $@
+
 system: ## Debian packages for everything, tests included (as root; otherwise prints the command)
 	scripts/system-packages all
 
@@ -31,7 +40,7 @@ demo: setup ## the whole loop on MiniGrid, the default strategy beside random, n
 serve: setup ## the service on ./asim-data at http://127.0.0.1:8000
 	$(BIN)/asim serve
 
-test: setup lint types imports ## what CI runs: lint, types, import contracts, tests
+test: setup-robots lint types imports ## what CI runs: lint, types, import contracts, tests
 	scripts/system-packages all
 	$(BIN)/python -m pytest
 
@@ -42,6 +51,9 @@ test-slow: setup ## the long tests: kills at random moments, scale (REPEAT=5 sho
 audit: setup ## known vulnerabilities of everything installed (asks PyPI; says so and fails where it cannot)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[audit]'
 	$(BIN)/pip-audit --strict --skip-editable --progress-spinner off
+
+test-robots: setup-robots ## the long tests of the robot simulators: whole episodes replayed
+	$(BIN)/python -m pytest -m robots
 
 lint: setup ## ruff
 	$(BIN)/ruff check .
@@ -62,6 +74,9 @@ bench-acquire: setup ## latency of POST /acquire with a ready queue
 
 bench-score: setup ## the scoring job beside the networks' bare forward pass
 	$(BIN)/python -m benchmarks.service.score
+
+bench-simulators: setup-robots ## steps a second of every robot task, and a picture of an episode of each
+	$(BIN)/python -m benchmarks.simulators
 
 bench-paper-minigrid: setup ## the paper's MiniGrid figures, resumable (QUICK=1: 4a and 4d with four arms)
 	$(BIN)/python -m benchmarks.paper.minigrid $(if $(QUICK),--quick)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from math import prod
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, StrictBool, ValidationError, model_validator
 
 from api_schemas.base import AS_JSON, Integer, Number, Positive, Schema
 
@@ -142,8 +142,70 @@ def minigrid_spaces(options: Mapping[str, object]) -> Spaces:
     )
 
 
-SIMULATOR_BEHAVIORS: dict[str, tuple[str, ...]] = {"minigrid": ("balanced", "expert", "mixture", "random")}
-SIMULATOR_SPACES: dict[str, Callable[[Mapping[str, object]], Spaces]] = {"minigrid": minigrid_spaces}
+class RobotOptions(Schema):
+    """Options that all robot simulators have. Without cameras an observation holds the poses of the task's objects in
+    their place; `horizon` is in steps and that of the task where it is left out."""
+
+    cameras: StrictBool = True
+    horizon: Annotated[int, Field(ge=1, le=10**6), AS_JSON] | None = None
+
+
+class RobosuiteOptions(RobotOptions):
+    """Options of the robosuite simulator."""
+
+    task: Literal["Lift", "PickPlaceCan", "NutAssemblySquare"] = "Lift"
+
+
+class ManiSkillOptions(RobotOptions):
+    """Options of the ManiSkill simulator."""
+
+    task: Literal["PullCube", "PokeCube", "LiftPegUpright"] = "PullCube"
+
+
+IMAGE_SHAPE = (64, 64, 3)
+POSE = 9  # numbers: a position, and two columns of a rotation matrix
+ROBOT_OBJECTS = {
+    "Lift": 1,
+    "PickPlaceCan": 1,
+    "NutAssemblySquare": 1,
+    "PullCube": 2,
+    "PokeCube": 3,
+    "LiftPegUpright": 1,
+}
+
+
+def robosuite_spaces(options: Mapping[str, object]) -> Spaces:
+    """Spaces of the robosuite simulator. A contract test holds them equal to the simulator's own."""
+    chosen = RobosuiteOptions.model_validate(dict(options))
+    return _robot_spaces(chosen.task, chosen.cameras)
+
+
+def maniskill_spaces(options: Mapping[str, object]) -> Spaces:
+    """Spaces of the ManiSkill simulator. A contract test holds them equal to the simulator's own."""
+    chosen = ManiSkillOptions.model_validate(dict(options))
+    return _robot_spaces(chosen.task, chosen.cameras)
+
+
+def _robot_spaces(task: str, cameras: bool) -> Spaces:
+    arm = Stream(dtype="float32", shape=(POSE + 2,))
+    seen: dict[StreamName, Stream]
+    if cameras:
+        seen = {name: Stream(dtype="uint8", shape=IMAGE_SHAPE) for name in ("front", "wrist")}
+    else:
+        seen = {"objects": Stream(dtype="float32", shape=(POSE * ROBOT_OBJECTS[task],))}
+    return Spaces(observations={**seen, "proprioception": arm}, actions=BoxActions(shape=(7,)))
+
+
+SIMULATOR_BEHAVIORS: dict[str, tuple[str, ...]] = {
+    "maniskill": ("expert", "random"),
+    "minigrid": ("balanced", "expert", "mixture", "random"),
+    "robosuite": ("expert", "random"),
+}
+SIMULATOR_SPACES: dict[str, Callable[[Mapping[str, object]], Spaces]] = {
+    "maniskill": maniskill_spaces,
+    "minigrid": minigrid_spaces,
+    "robosuite": robosuite_spaces,
+}
 
 
 class Environment(Schema):

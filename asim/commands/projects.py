@@ -22,7 +22,7 @@ LabelBudget = Annotated[int | None, typer.Option(min=1, help="Pool labels that m
 def create(
     name: str,
     *,
-    simulator: Annotated[str | None, typer.Option(help="A simulator that we ship: minigrid.")] = None,
+    simulator: Annotated[str | None, typer.Option(help="One that we ship: maniskill, minigrid, robosuite.")] = None,
     option: Annotated[list[str] | None, typer.Option(help="Of the simulator, as name=value; repeatable.")] = None,
     spaces: Annotated[Path | None, typer.Option(help="JSON file with the spaces of your own environment.")] = None,
     strategy: Strategy = None,

@@ -93,7 +93,13 @@ def test_mistakes_cost_one_sentence(asim: Command, own: str, tmp_path: Path) -> 
     mistakes = {
         ("project", "show", "nothing"): "no project is named 'nothing'",
         ("project", "create", own, "--simulator", "minigrid"): f"a project '{own}' exists already",
-        ("project", "create", "x", "--simulator", "minigrit"): "'minigrit' is not one of ['minigrid']",
+        (
+            "project",
+            "create",
+            "x",
+            "--simulator",
+            "minigrit",
+        ): "'minigrit' is not one of ['maniskill', 'minigrid', 'robosuite']",
         ("project", "create", "x", "--simulator", "minigrid", "--option", "size"): "'size' is not of the form",
         ("project", "create", "x", "--spaces", str(tmp_path / "none.json")): "No such file or directory",
         ("project", "set", own, "--strategy", "best"): "strategy: Input should be 'random'",

@@ -1,18 +1,22 @@
 """What api_schemas says twice is what simulators and strategies say themselves."""
 
 import itertools
+from collections.abc import Callable, Mapping
 from typing import get_args
 
 import gymnasium as gym
 import pytest
 from pydantic import ValidationError
 
+from api_schemas.base import Schema
 from api_schemas.environments import (
     SIMULATOR_BEHAVIORS,
     SIMULATOR_SPACES,
     BoxActions,
     DiscreteActions,
+    ManiSkillOptions,
     MiniGridOptions,
+    RobosuiteOptions,
     Spaces,
     Stream,
 )
@@ -29,9 +33,10 @@ from api_schemas.strategies import (
 from models.acquisition import BATCH_RULES, EXPLORING, STRATEGIES
 from models.acquisition.base import Models
 from models.network import KINDS
-from workers.simulators import minigrid
-from workers.simulators.base import OptionError
+from workers.simulators import maniskill, minigrid, robosuite
+from workers.simulators.base import OptionError, SimulatorUnavailable
 from workers.simulators.catalog import SIMULATORS, behavior_names, make_simulator
+from workers.simulators.robot_options import RobotOptions
 
 SIZES = [{"room_size": 6}, {"room_size": 8}, {"room_size": 8, "objects": 14, "noisy_tiles": 4}, {}]
 
@@ -60,6 +65,56 @@ def test_both_know_the_same_simulators_and_behaviors() -> None:
         assert sorted(behaviors) == sorted(behavior_names(name))
 
 
+ROBOTS: dict[str, tuple[type[Schema], dict[str, int]]] = {
+    "robosuite": (RobosuiteOptions, robosuite.HORIZONS),
+    "maniskill": (ManiSkillOptions, maniskill.HORIZONS),
+}
+
+
+@pytest.mark.parametrize("cameras", [True, False])
+@pytest.mark.parametrize(("name", "task"), [(name, task) for name in ROBOTS for task in ROBOTS[name][1]])
+def test_a_robots_spaces_are_those_of_the_simulator(name: str, task: str, cameras: bool) -> None:
+    options = {"task": task, "cameras": cameras}
+    spaces = SIMULATOR_SPACES[name](options)
+    try:
+        simulator = make_simulator(name, options)
+    except SimulatorUnavailable as error:
+        pytest.skip(str(error))
+    streams = {
+        key: Stream.model_validate({"dtype": str(space.dtype), "shape": space.shape})
+        for key, space in simulator.observation_space.items()
+    }
+    assert spaces.observations == streams
+    space = simulator.action_space
+    assert isinstance(space, gym.spaces.Box)
+    assert spaces.actions == BoxActions(shape=space.shape, low=float(space.low.min()), high=float(space.high.max()))
+    simulator.close()
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_robots_options_are_those_of_the_simulator(name: str) -> None:
+    schema, horizons = ROBOTS[name]
+    assert get_args(schema.model_fields["task"].annotation) == tuple(horizons)
+    parsed = RobotOptions.parse(name, horizons, {})
+    assert schema().model_dump() == {**vars(parsed), "horizon": None}
+    values = itertools.product(
+        [*horizons, "chess", 1], [True, False, 1, "true"], [None, 0, 1, 10**6, 10**6 + 1, 2.0, "9"]
+    )
+    for task, cameras, horizon in values:
+        options: dict[str, object] = {"task": task, "cameras": cameras, "horizon": horizon}
+        taken = _is_taken(schema.model_validate, options)
+        assert taken == _is_taken(lambda o: RobotOptions.parse(name, horizons, o), options), options
+    assert not _is_taken(schema.model_validate, {"colour": "red"})
+
+
+def _is_taken(parse: Callable[[Mapping[str, object]], object], options: Mapping[str, object]) -> bool:
+    try:
+        parse(options)
+    except (ValidationError, OptionError):
+        return False
+    return True
+
+
 def test_both_take_and_refuse_the_same_options() -> None:
     assert MiniGridOptions().model_dump() == vars(minigrid.MiniGridOptions())
     values = itertools.product(["any", "ball_delivery", "chess"], [5, 6, 7, 8], [2, 3, 4, 14, 15], [0, 4, 5], [0, 1])
@@ -71,23 +126,8 @@ def test_both_take_and_refuse_the_same_options() -> None:
             "noisy_tiles": noisy_tiles,
             "max_steps": max_steps,
         }
-        assert _taken_here(options) == _taken_there(options), options
-
-
-def _taken_here(options: dict[str, object]) -> bool:
-    try:
-        MiniGridOptions.model_validate(options)
-    except ValidationError:
-        return False
-    return True
-
-
-def _taken_there(options: dict[str, object]) -> bool:
-    try:
-        minigrid.MiniGridOptions.parse(options)
-    except OptionError:
-        return False
-    return True
+        taken = _is_taken(MiniGridOptions.model_validate, options)
+        assert taken == _is_taken(minigrid.MiniGridOptions.parse, options), options
 
 
 def test_strategies_are_those_of_the_science() -> None:

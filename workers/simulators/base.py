@@ -20,7 +20,7 @@ An episode, recorded so that any of its steps can be replayed later:
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import gymnasium as gym
 import numpy as np
@@ -47,6 +47,10 @@ class OptionError(SimulatorError):
 
 class StateError(SimulatorError):
     """A state that does not belong to this simulator."""
+
+
+class SimulatorUnavailable(SimulatorError):
+    """A simulator that is not installed on this machine, or cannot draw here; the message names the command to run."""
 
 
 class Step(NamedTuple):
@@ -109,3 +113,14 @@ def check_state(state: State, expected: Mapping[str, tuple[tuple[int, ...], str]
         array = state[name]
         if array.shape != shape or array.dtype != np.dtype(dtype):
             raise StateError(f"State {name!r} must be {dtype} {shape}, but it is {array.dtype} {array.shape}.")
+
+
+def check_finite(state: State) -> None:
+    """Raises StateError where an array of `state` holds a number that is none."""
+    for name, array in state.items():
+        if not np.isfinite(array).all():
+            raise StateError(f"State {name!r} holds a number that is not finite, at {_first_bad(array)}.")
+
+
+def _first_bad(array: NDArray[Any]) -> list[int]:
+    return cast(list[int], np.argwhere(~np.isfinite(array))[0].tolist())

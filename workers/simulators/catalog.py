@@ -7,7 +7,11 @@ from typing import cast
 from workers.simulators.base import Behavior, OptionError, Simulator
 
 # Each module offers make_simulator(options), make_behavior(name, simulator) and the tuple BEHAVIORS.
-SIMULATORS: dict[str, str] = {"minigrid": "workers.simulators.minigrid"}
+SIMULATORS: dict[str, str] = {
+    "maniskill": "workers.simulators.maniskill",
+    "minigrid": "workers.simulators.minigrid",
+    "robosuite": "workers.simulators.robosuite",
+}
 
 
 def make_simulator(name: str, options: Mapping[str, object]) -> Simulator:
