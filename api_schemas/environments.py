@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StrictBool, ValidationError, model_validator
 
-from api_schemas.base import AS_JSON, Integer, Number, Positive, Schema
+from api_schemas.base import AS_JSON, Integer, Number, Schema
 
 MOST_AXES = 8  # of one array, time not counted
 MOST_NUMBERS = 2**24  # of one observation in one stream
@@ -99,9 +99,9 @@ class MiniGridOptions(Schema):
 
     task: Literal["key_delivery", "ball_delivery", "object_matching", "any"] = "any"
     room_size: Literal[6, 8] = 6
-    objects: Annotated[int, Field(ge=3, le=14), AS_JSON] = 3
-    noisy_tiles: Annotated[int, Field(ge=0, le=4), AS_JSON] = 0
-    max_steps: Positive = 120
+    objects: Annotated[int, Field(ge=3, le=14, strict=True)] = 3
+    noisy_tiles: Annotated[int, Field(ge=0, le=4, strict=True)] = 0
+    max_steps: Annotated[int, Field(ge=1, strict=True)] = 120
 
     @model_validator(mode="after")
     def _room_for_the_objects(self) -> "MiniGridOptions":
@@ -147,7 +147,7 @@ class RobotOptions(Schema):
     their place; `horizon` is in steps and that of the task where it is left out."""
 
     cameras: StrictBool = True
-    horizon: Annotated[int, Field(ge=1, le=10**6), AS_JSON] | None = None
+    horizon: Annotated[int, Field(ge=1, le=10**6, strict=True)] | None = None
 
 
 class RobosuiteOptions(RobotOptions):
