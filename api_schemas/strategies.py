@@ -24,7 +24,7 @@ StrategyName = Literal[
 BatchRuleName = Literal["top", "rank_noise", "kmeans_plus_plus", "k_center", "signatures"]
 BATCH_RULE_NAMES: tuple[str, ...] = get_args(BatchRuleName)
 DEFAULT_BATCH_RULE: BatchRuleName = "signatures"
-DEFAULT_STRATEGY: StrategyName = "cycle"
+DEFAULT_STRATEGY: StrategyName = "confident_cycle"
 COLD_START_STRATEGY: StrategyName = "random"
 STRATEGY_NAMES: tuple[str, ...] = get_args(StrategyName)
 

@@ -13,7 +13,7 @@ from tests.figures import Figures
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("arm", [("cycle", "signatures"), ("progress", "k_center"), ("uncertainty", "top")])
+@pytest.mark.parametrize("arm", [("confident_cycle", "signatures"), ("progress", "k_center"), ("uncertainty", "top")])
 def test_a_project_picks_what_the_loop_picks(
     arm: tuple[str, str], small_rooms: Rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, figures: Figures
 ) -> None:

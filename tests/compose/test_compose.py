@@ -167,7 +167,7 @@ def test_the_services_run_the_loop_and_metrics_tell_its_story(
         story = check_same_story(machine.url, secret, postgres_url)
         assert story["asim_rounds", "scaled", "current"] == 1
         assert story["asim_model_error_loss", "scaled"] == point.model_error.loss
-        assert client.acquire(project.id, 5, wait=START_SECONDS).strategy == "cycle"
+        assert client.acquire(project.id, 5, wait=START_SECONDS).strategy == "confident_cycle"
         story = check_same_story(machine.url, secret, postgres_url)
         assert (story["asim_leases", "scaled"], story["asim_segments", "scaled", "leased"]) == (1, 5)
         told = scraped(machine.url, secret)

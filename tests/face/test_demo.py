@@ -26,12 +26,12 @@ def test_the_demo_compares_two_arms_that_start_alike(
     demo(seed=3, keep=tmp_path / "data", plan=SMALL)
     curves = json.loads((tmp_path / "results" / "demo-seed-3.json").read_text())
     labels = {arm: [point["labels"] for point in curve["points"]] for arm, curve in curves.items()}
-    assert labels == {"cycle": [40, 60], "random": [40, 60]}
+    assert labels == {"confident_cycle": [40, 60], "random": [40, 60]}
     first = [curve["points"][0]["model_error"]["loss"] for curve in curves.values()]
     assert first[0] == first[1]
     assert (tmp_path / "results" / "demo-seed-3.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
-    assert "at 60 labels, cycle's test loss" in printed
+    assert "at 60 labels, confident_cycle's test loss" in printed
     assert "the demo took" in printed
     assert not (tmp_path / "data" / "serve.json").exists()
 

@@ -89,7 +89,7 @@ def test_the_loop_runs_through_a_celery_worker(scaled: Scaled) -> None:
     eventually(lambda: client.health().status == "ok", START_SECONDS, "no worker is alive")
     first, acknowledged = first_round(client, project, generator)
     batch = client.acquire(project.id, 20, wait=JOB_SECONDS)
-    assert (batch.strategy, batch.round) == ("cycle", first.id)
+    assert (batch.strategy, batch.round) == ("confident_cycle", first.id)
     accepted = run_labeling(client, batch, generator)
     acknowledged += [(receipt.trajectory, receipt.start) for receipt in accepted.receipts]
 

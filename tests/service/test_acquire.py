@@ -82,7 +82,7 @@ def test_the_first_batch_waits_for_a_scoring(on_both: Served) -> None:
 def test_a_cold_start_names_the_strategy_that_ranked(served: Served) -> None:
     project = filled(served)
     batch = served.acquire(project)
-    assert (batch["strategy"], batch["requested_strategy"]) == ("random", "cycle")
+    assert (batch["strategy"], batch["requested_strategy"]) == ("random", "confident_cycle")
     batch = served.acquire(project, strategy="uncertainty")
     assert (batch["strategy"], batch["requested_strategy"]) == ("random", "uncertainty")
 

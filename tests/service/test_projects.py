@@ -22,7 +22,7 @@ def test_a_project_is_made_with_its_simulators_spaces_and_defaults(served: Serve
     assert served.get(answer.headers["location"]) == project
     assert (project["segment_length"], project["stride"], project["held_out_fraction"]) == (1, 1, 0.1)
     assert project["policy"] == {
-        "strategy": "cycle",
+        "strategy": "confident_cycle",
         "batch_rule": "signatures",
         "round_labels": 100,
         "label_budget": None,

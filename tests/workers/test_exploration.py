@@ -45,7 +45,7 @@ def test_a_strategy_proposes_under_the_rounds_models(trained: Loop) -> None:
     (job,) = trained.jobs("propose_explorations")
     assert (job.state, job.queue) == ("queued", "score")
     batch = trained.acquire(5, mode="explore")
-    assert (batch.mode, batch.strategy, batch.requested_strategy) == ("explore", "cycle", "cycle")
+    assert (batch.mode, batch.strategy, batch.requested_strategy) == ("explore", "confident_cycle", "confident_cycle")
     assert (batch.round, batch.reason) == (trained.project.current_round, None)
     assert [len(item.actions or ()) for item in batch.items] == [1] * 5
     assert trained.project.counts.leased == 0  # no segment is claimed
@@ -59,14 +59,14 @@ def test_proposals_have_the_scores_of_the_strategy_on_the_rounds_networks(traine
     with trained.worker.database.read() as session:
         project = session.get_one(ProjectRow, trained.project.id)
         windows = data.windows_of(session, project, pool_queries.memberships(session, project.id, "pool"), None)
-    needs = STRATEGIES["cycle"].needs
+    needs = STRATEGIES["confident_cycle"].needs
     models = scoring.load_models(trained.worker.database, trained.blobs, project, trained.project.current_round, needs)
     (generator,) = (m for m in trained.client.models(project.id) if m.kind == "subgoal_generator")
     subgoals = checkpoints.load(trained.blobs.get("weights", generator.sha256))
     models = replace(models, subgoal_generator=cast(SubgoalGenerator, subgoals))
     batch = data.load(trained.blobs, windows, 1)
     batch = batch.take(distinct(looks(at(batch.observations, 0))))  # of rooms that look the same, one
-    found = explore(EXPLORING["cycle"], models, at(batch.observations, 0), 1, torch.Generator())
+    found = explore(EXPLORING["confident_cycle"], models, at(batch.observations, 0), 1, torch.Generator())
     names = [batch.segments[int(row)] for row in found.states]
     direct = {
         (name.trajectory, name.start, tuple(actions)): score
@@ -124,7 +124,7 @@ def test_until_a_subgoal_generator_is_trained_chance_explores(labeled: Loop) -> 
         run_next(labeled.worker)
     assert labeled.acquire(4, mode="explore").strategy == "random"
     labeled.drain()
-    assert labeled.acquire(4, mode="explore").strategy == "cycle"
+    assert labeled.acquire(4, mode="explore").strategy == "confident_cycle"
 
 
 def test_another_strategys_networks_are_trained_before_it_proposes(trained: Loop) -> None:
@@ -167,7 +167,7 @@ def test_a_cancelled_job_is_asked_for_anew(trained: Loop) -> None:
         trained.client.acquire(trained.project.id, 1, mode="explore", wait=0)
     trained.cancel(trained.jobs("propose_explorations")[0].id)
     assert trained.client.round(trained.project.current_round or trained.project.id).status == "current"
-    assert trained.acquire(2, mode="explore").strategy == "cycle"
+    assert trained.acquire(2, mode="explore").strategy == "confident_cycle"
     assert len(trained.jobs("propose_explorations")) == 2
 
 
@@ -195,7 +195,7 @@ def test_what_was_given_out_is_not_proposed_again_and_in_the_end_there_is_nothin
         while True:
             given.extend(proposals(trained.acquire(450, mode="explore")))
 
-    with pytest.raises(Conflict, match=r"all that cycle finds to explore .* has been given out"):
+    with pytest.raises(Conflict, match=r"all that confident_cycle finds to explore .* has been given out"):
         ask_for_all()
     rooms = {proposal[:2] for proposal in given}
     assert len(given) == len(set(given)) == len(rooms) * 7

@@ -62,7 +62,7 @@ def labeled_of(loop: Loop) -> set[Segment]:
     return {(label.trajectory, label.start) for label in loop.client.labels(loop.project.id)}
 
 
-@pytest.mark.parametrize("strategy", ["cycle", "random"])
+@pytest.mark.parametrize("strategy", ["confident_cycle", "random"])
 def test_shards_cover_every_segment_once(opened: OpenLoop, trained_folder: Any, strategy: str) -> None:
     loop = opened(trained_folder, shard_transitions=90)
     loop.collect(45, seed=31, split="pool")
@@ -80,15 +80,15 @@ def test_scores_are_those_of_the_strategy_on_the_rounds_networks(opened: OpenLoo
     loop = opened(trained_folder, shard_transitions=150)
     loop.label(3)
     loop.train()
-    found = newest(loop, "cycle")
+    found = newest(loop, "confident_cycle")
     with loop.worker.database.read() as session:
         project = session.get_one(ProjectRow, loop.project.id)
         models = scoring.load_models(
-            loop.worker.database, loop.blobs, project, found.round_id, STRATEGIES["cycle"].needs
+            loop.worker.database, loop.blobs, project, found.round_id, STRATEGIES["confident_cycle"].needs
         )
         windows = data.windows_of(session, project, pool_queries.memberships(session, project.id, "pool"), None)
     batch = data.load(loop.blobs, windows, 1)
-    direct = score_pool(STRATEGIES["cycle"], models, batch, torch.Generator())
+    direct = score_pool(STRATEGIES["confident_cycle"], models, batch, torch.Generator())
     stored = stored_scores(loop, found.id)
     assert found.shards > 2
     assert [segment for segment, _ in stored] == [(each.trajectory, each.start) for each in batch.segments]
@@ -101,7 +101,7 @@ def test_under_top_the_queue_is_the_order_of_scores(trained: Loop) -> None:
     trained.change(batch_rule="top")
     trained.label(3)
     trained.train()
-    scores = [score for _, score in queue_of(trained, newest(trained, "cycle").id)]
+    scores = [score for _, score in queue_of(trained, newest(trained, "confident_cycle").id)]
     assert scores == sorted(scores, key=lambda score: -float(score or 0))
     best = [item.score for item in trained.acquire(10).items]
     assert best == scores[:10]
@@ -123,7 +123,7 @@ def test_every_batch_rule_queues_the_same_segments_in_its_own_order(trained: Loo
         trained.change(batch_rule=rule)
         trained.client.start_round(trained.project.id)
         trained.drain()
-        ranked.append([segment for segment, _ in queue_of(trained, newest(trained, "cycle").id)])
+        ranked.append([segment for segment, _ in queue_of(trained, newest(trained, "confident_cycle").id)])
     assert all(set(each) == set(ranked[0]) for each in ranked)
     assert len({tuple(each) for each in ranked}) == len(BATCH_RULES)
 
@@ -134,7 +134,7 @@ def test_labeled_and_leased_segments_are_not_queued(trained: Loop) -> None:
     trained.clock.advance(5)
     trained.label(5, "random")
     trained.train()
-    queued = {segment for segment, _ in queue_of(trained, newest(trained, "cycle").id)}
+    queued = {segment for segment, _ in queue_of(trained, newest(trained, "confident_cycle").id)}
     assert not queued & leased
     assert not queued & labeled_of(trained)
     assert expired - labeled_of(trained) <= queued
@@ -145,7 +145,7 @@ def test_the_queue_is_no_longer_than_the_setting(opened: OpenLoop, trained_folde
     loop = opened(trained_folder, queue_length=30)
     loop.label(3)
     loop.train()
-    found = newest(loop, "cycle")
+    found = newest(loop, "confident_cycle")
     queued, scored = queue_of(loop, found.id), stored_scores(loop, found.id)
     taken = labeled_of(loop)
     best = sorted((score for segment, score in scored if segment not in taken), reverse=True)[:30]
@@ -164,7 +164,7 @@ def test_a_drained_queue_is_selected_again_without_scoring(opened: OpenLoop, tra
     assert loop.jobs("select_queue")
 
 
-@pytest.mark.parametrize("strategy", ["cycle", "random"])
+@pytest.mark.parametrize("strategy", ["confident_cycle", "random"])
 def test_a_pool_that_grew_can_be_given_out_to_its_end(trained: Loop, strategy: str) -> None:
     trained.label(3)
     trained.train()
@@ -198,7 +198,7 @@ def test_a_crash_while_scoring_costs_an_attempt_and_nothing_else(
     trained.clock.advance(10)
     trained.drain()
     assert trained.client.round(asked.id).status == "current"
-    queued = [segment for segment, _ in queue_of(trained, newest(trained, "cycle").id)]
+    queued = [segment for segment, _ in queue_of(trained, newest(trained, "confident_cycle").id)]
     assert len(queued) == len(set(queued)) == trained.project.counts.unlabeled
     assert [job.attempts for job in trained.jobs("merge_scores")[-1:]] == [2 if kind == "publish" else 1]
 
@@ -206,13 +206,13 @@ def test_a_crash_while_scoring_costs_an_attempt_and_nothing_else(
 def test_a_finished_merge_that_runs_again_leaves_a_whole_queue(trained: Loop) -> None:
     trained.label(3)
     trained.train()
-    found = newest(trained, "cycle")
+    found = newest(trained, "confident_cycle")
     before = {segment for segment, _ in queue_of(trained, found.id)}
     given = set(segments_of(trained.acquire(7)))
     trained.requeue(trained.jobs("merge_scores")[-1].id)
     assert trained.drain() == 1
     assert {segment for segment, _ in queue_of(trained, found.id)} == before - given
-    assert newest(trained, "cycle").status == "ready"
+    assert newest(trained, "confident_cycle").status == "ready"
 
 
 def test_a_finished_shard_that_runs_again_starts_no_second_merge(trained: Loop) -> None:
@@ -245,10 +245,10 @@ def test_longer_segments_are_scored_and_trained_as_wholes(empty: Loop) -> None:
     empty.collect(300, seed=1, split="pool")
     empty.label(20, "random")
     empty.train()
-    found = newest(empty, "cycle")
+    found = newest(empty, "confident_cycle")
     assert sorted(segment for segment, _ in stored_scores(empty, found.id)) == sorted(pool_of(empty))
     batch = empty.label(5)
-    assert batch.strategy == "cycle"
+    assert batch.strategy == "confident_cycle"
     assert all(item.start % 3 == 0 and item.length == 3 for item in batch.items)
 
 

@@ -1,6 +1,6 @@
 """Figure 4d: what an arm's labels are worth. 200 uniform labels, then batches of 100 chosen by the arm.
 
-    python -m benchmarks.paper.minigrid.acquisition --arms random:top cycle:signatures --seeds 5
+    python -m benchmarks.paper.minigrid.acquisition --arms random:top confident_cycle:signatures --seeds 5
 
 An arm is `strategy:rule`. All arms get the same pool, seed labels, budgets, schedules and draws.
 """
