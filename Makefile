@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 export PYTHONSAFEPATH := 1
 SEED ?= 0
 REPEAT ?= 50
+JOBS ?= 2
 
 .PHONY: help setup setup-robots system demo serve test test-slow test-robots audit lint types imports format bench-acquire \
 	bench-score bench-simulators bench-paper-minigrid bench-paper-minigrid-full clean
@@ -42,7 +43,7 @@ serve: setup ## the service on ./asim-data at http://127.0.0.1:8000
 
 test: setup-robots lint types imports ## what CI runs: lint, types, import contracts, tests
 	scripts/system-packages all
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 test-slow: setup ## the long tests: kills at random moments, scale (REPEAT=5 shortens the kills; ASIM_TEST_SEED=n repeats)
 	scripts/system-packages all
