@@ -20,7 +20,7 @@ from workers.simulators.base import (
     Step,
 )
 from workers.simulators.maniskill_env import TASKS, make_env
-from workers.simulators.robot_behaviors import RandomBehavior
+from workers.simulators.robot_behaviors import NoisyBehavior, RandomBehavior
 from workers.simulators.robot_observation import ACTION_SPACE, checked_action
 from workers.simulators.robot_options import RobotOptions
 from workers.simulators.robot_progress import Progress
@@ -106,6 +106,7 @@ def make_simulator(options: Mapping[str, object]) -> Simulator:
 
 _FACTORIES: dict[str, Callable[[], Behavior]] = {
     "expert": lambda: ExpertBehavior(maniskill_experts.plan),
+    "noisy_expert": lambda: NoisyBehavior(ExpertBehavior(maniskill_experts.plan)),
     "random": RandomBehavior,
 }
 BEHAVIORS = tuple(_FACTORIES)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from workers.simulators import robosuite_experts, robot_observation
 from workers.simulators.base import Action, Behavior, Observation, OptionError, Simulator, SimulatorError, State, Step
 from workers.simulators.robosuite_env import TASKS, make_env
-from workers.simulators.robot_behaviors import RandomBehavior
+from workers.simulators.robot_behaviors import NoisyBehavior, RandomBehavior
 from workers.simulators.robot_observation import ACTION_SPACE, checked_action
 from workers.simulators.robot_options import RobotOptions
 from workers.simulators.robot_progress import Progress
@@ -96,6 +96,7 @@ def make_simulator(options: Mapping[str, object]) -> Simulator:
 
 _FACTORIES: dict[str, Callable[[], Behavior]] = {
     "expert": lambda: ExpertBehavior(robosuite_experts.plan),
+    "noisy_expert": lambda: NoisyBehavior(ExpertBehavior(robosuite_experts.plan)),
     "random": RandomBehavior,
 }
 BEHAVIORS = tuple(_FACTORIES)
