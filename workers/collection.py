@@ -70,7 +70,7 @@ def _new_episodes(
     def tell(left: int, repeats: int) -> None:
         job.report(1 - left / asked.transitions, f"{repeats} episodes in a row were known before")
 
-    return new_episodes(simulator, behavior, asked.transitions, asked.seed, known, tell)
+    return new_episodes(simulator, behavior, asked.transitions, asked.seed, known, tell, job.go_on)
 
 
 def _behavior(project: ProjectRow, asked: CollectionCreate) -> str:

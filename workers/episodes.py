@@ -48,17 +48,19 @@ def new_episodes(
     seed: int,
     known: Callable[[Episode], bool] = lambda episode: False,
     on_repeat: Callable[[int, int], None] = lambda left, repeats: None,
+    on_step: Callable[[], None] = lambda: None,
 ) -> Iterator[Episode]:
     """Episodes of `transitions` transitions in all, decided by the seed; none twice, and none that is `known`.
 
     Ends early where the simulator has nothing new to show. on_repeat: told the transitions left and how many episodes
-    in a row were seen before; may raise to stop.
+    in a row were seen before. on_step: called after every step, as a robot's episode takes long. Both may raise to
+    stop.
     """
     rng = np.random.default_rng(seed)
     seen: set[bytes] = set()
     left, repeats = transitions, 0
     while left > 0 and repeats < REPEATS:
-        episode = _episode(simulator, behavior, rng, left)
+        episode = _episode(simulator, behavior, rng, left, on_step)
         digest = _digest(episode)
         if digest in seen or known(episode):
             repeats += 1
@@ -103,7 +105,9 @@ class Quota:
         return starts
 
 
-def _episode(simulator: Simulator, behavior: Behavior, rng: np.random.Generator, most: int) -> Episode:
+def _episode(
+    simulator: Simulator, behavior: Behavior, rng: np.random.Generator, most: int, on_step: Callable[[], None]
+) -> Episode:
     """The next episode, cut after `most` transitions so that a collection is as long as was asked for."""
     seed, generator = int(rng.integers(2**31)), dict(rng.bit_generator.state)
     observations, states = [simulator.reset(seed)], [simulator.state()]
@@ -115,6 +119,7 @@ def _episode(simulator: Simulator, behavior: Behavior, rng: np.random.Generator,
         observations.append(step.observation)
         states.append(simulator.state())
         actions.append(int(action) if np.ndim(action) == 0 else action)
+        on_step()
         if step.terminated or step.truncated:
             break
     return Episode(_stacked(observations), _stacked(states), actions, seed, generator)

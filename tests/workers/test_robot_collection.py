@@ -2,17 +2,22 @@
 
 import re
 import sys
+import threading
+import time
 from typing import Any, cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from api_schemas.collections import CollectionCreate
 from api_schemas.environments import Environment
 from asim.errors import Invalid
+from service.reaper import reap
 from tests.workers.conftest import OpenLoop, new_project
 from tests.workers.in_process import Loop
-from workers.simulators.base import SimulatorError, SimulatorUnavailable, Step
+from workers.job import RunningJob
+from workers.simulators.base import Action, SimulatorError, SimulatorUnavailable, Step
 from workers.simulators.catalog import make_behavior, make_simulator
 from workers.simulators.maniskill import ManiSkillSimulator
 
@@ -120,3 +125,48 @@ def test_an_observation_that_does_not_fit_the_project_is_not_stored(
 
 def _breaks_down(simulator: ManiSkillSimulator, action: NDArray[Any]) -> Step:
     raise SimulatorError("Simulator 'maniskill', task 'PullCube', broke down in step 1 of an episode: no number.")
+
+
+def test_a_hung_simulator_loses_its_job_to_a_worker_that_goes_on(
+    opened: OpenLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = project_of(opened, "maniskill", cameras=False, horizon=50)
+    advance, hung, released = ManiSkillSimulator.advance, threading.Event(), threading.Event()
+
+    def hangs_once(simulator: ManiSkillSimulator, action: Action) -> None:
+        if not hung.is_set():
+            hung.set()
+            released.wait(60)
+        advance(simulator, action)
+
+    monkeypatch.setattr(ManiSkillSimulator, "advance", hangs_once)
+    impatient = loop.settings.model_copy(update={"silence_seconds": 0.3, "job_lease_seconds": 1.5})
+    asked = loop.client.collect(CollectionCreate(project=loop.project.id, transitions=12, split="pool"))
+    first = threading.Thread(target=loop.drain, args=(loop.another_worker(impatient),))
+    first.start()
+    assert hung.wait(30)
+    time.sleep(0.6)  # from here on it counts as hung, and its lease is not renewed
+    loop.clock.advance(60)
+    reap(loop.worker.database, loop.clock())
+    loop.clock.advance(600)  # it waits a little for its next attempt
+    loop.drain()
+    released.set()
+    first.join(60)
+    done = loop.client.job(asked.id)
+    assert (done.state, done.attempts) == ("done", 2)
+    assert loop.project.counts.pool_segments == 12
+
+
+def test_a_long_episode_says_at_every_step_that_it_is_at_work(
+    opened: OpenLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = project_of(opened, "maniskill", cameras=False, horizon=50)
+    told, go_on = list[RunningJob](), RunningJob.go_on
+
+    def counted(job: RunningJob) -> None:
+        told.append(job)
+        go_on(job)
+
+    monkeypatch.setattr(RunningJob, "go_on", counted)
+    loop.collect(50, behavior="random")
+    assert len(told) > 50

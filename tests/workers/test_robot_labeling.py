@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from api_schemas.labels import Label
 from tests.workers.conftest import OpenLoop, new_project
-from tests.workers.in_process import Loop
+from tests.workers.in_process import Loop, segments_of
 from tests.workers.test_robot_collection import LIBRARIES, project_of
 from workers.labeling import run_labeling
 from workers.simulators.base import Action, SimulatorError, Step
@@ -193,3 +193,25 @@ def test_segments_of_several_steps_are_labeled_and_explored(
     brought = {receipt.trajectory for receipt in accepted.receipts}
     explored = [label.actions for label in loop.client.labels(loop.project.id) if label.trajectory in brought]
     assert sorted(map(str, explored)) == sorted(str(item.actions) for item in batch.items)
+
+
+def test_a_labeler_that_dies_gives_its_segments_and_its_budget_to_the_next(
+    opened: OpenLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = project_of(opened, "maniskill", cameras=False)
+    loop.change(label_budget=6)
+    loop.collect(6, behavior="random", split="pool")
+    batch = loop.acquire(6, "random", lease_seconds=60)
+
+    def dies(simulator: ManiSkillSimulator, action: Action) -> None:
+        raise SystemExit(9)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ManiSkillSimulator, "advance", dies)
+        with pytest.raises(SystemExit):
+            run_labeling(loop.client, batch, GENERATOR)
+    assert loop.project.budget.reserved == 6
+    loop.clock.advance(61)
+    again = loop.label(6, "random")
+    assert sorted(segments_of(again)) == sorted(segments_of(batch))
+    assert (loop.project.budget.spent, loop.project.budget.reserved) == (6, 0)
