@@ -20,6 +20,7 @@ NUDGE = 0.02  # of an action, for a slope
 CLOSE = 1e-3  # in units of `motion`: 0.01 mrad, 0.1 mrad/s, 5 micrometres
 LITTLE = 1e-3  # an improvement by less than this part of the error ends a search
 STARTS, ITERATIONS, DAMPINGS = 3, 8, 4
+SPREAD = 0.7  # of the starts that are drawn: inside the box, where slopes lead somewhere
 
 
 class Found(NamedTuple):
@@ -49,17 +50,14 @@ class ActionSearch:
         """The action of a step, from a guess (n,) on; the first within tolerance, or the best of all starts."""
         before, target = recording.state(step), self._motion(recording.state(step + 1))
         observed = recording.observed(step + 1)[self._settings.stream]
-        rng, best = np.random.default_rng(0), None
-        for _ in range(STARTS):
-            point = self._descend(before, target, self._gripped(before, target, start))
+        others = np.random.default_rng(0).uniform(-SPREAD, SPREAD, (STARTS - 1, len(start)))
+        best = Found(start.astype(np.float32), np.inf)
+        for first in (start, *others):
+            point = self._descend(before, target, self._gripped(before, target, first))
             found = self._verified(before, point.action, observed)
-            if best is None or found.residual < best.residual:
-                best = found
+            best = found if found.residual < best.residual else best  # a residual that is no number is never less
             if best.residual <= self._settings.tolerance:
                 break
-            start = rng.uniform(-0.7, 0.7, len(start))
-        if best is None:
-            raise RuntimeError(f"{STARTS} starts are none")
         return best
 
     def _motion(self, state: State) -> Vector:
