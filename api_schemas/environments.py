@@ -197,10 +197,11 @@ def _robot_spaces(task: str, cameras: bool) -> Spaces:
 
 
 SIMULATOR_BEHAVIORS: dict[str, tuple[str, ...]] = {
-    "maniskill": ("expert", "random"),
+    "maniskill": ("expert", "noisy_expert", "random"),
     "minigrid": ("balanced", "expert", "mixture", "random"),
-    "robosuite": ("expert", "random"),
+    "robosuite": ("expert", "noisy_expert", "random"),
 }
+DEFAULT_BEHAVIORS = {"maniskill": "noisy_expert", "minigrid": "mixture", "robosuite": "noisy_expert"}
 SIMULATOR_SPACES: dict[str, Callable[[Mapping[str, object]], Spaces]] = {
     "maniskill": maniskill_spaces,
     "minigrid": minigrid_spaces,

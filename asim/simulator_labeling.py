@@ -7,7 +7,8 @@ from api_schemas.projects import Project
 from asim.client import Client
 from asim.errors import AsimError
 from asim.report import Report
-from workers.labeling import UnanswerableItem, run_labeling
+from workers.labeling import run_labeling
+from workers.unanswerable import UnanswerableItem
 
 
 def given(client: Client, project: Project, acquisition: str, token: int | None) -> Acquisition:

@@ -4,8 +4,8 @@ from datetime import datetime
 
 from sqlalchemy.orm import Session
 
-from api_schemas.collections import CollectionCreate
-from api_schemas.environments import SIMULATOR_BEHAVIORS, DiscreteActions
+from api_schemas.collections import CollectionCreate, CollectionLabels
+from api_schemas.environments import DEFAULT_BEHAVIORS, SIMULATOR_BEHAVIORS, DiscreteActions
 from api_schemas.jobs import Collect
 from service import jobs, projects
 from service.errors import InvalidField, NoSimulator, UnknownBehavior
@@ -18,17 +18,20 @@ def request(session: Session, asked: CollectionCreate, now: datetime, max_attemp
     simulator = projects.environment_of(project).simulator
     if simulator is None:
         raise NoSimulator(project.id)
-    behaviors = SIMULATOR_BEHAVIORS[simulator]
-    if asked.behavior not in behaviors:
-        raise UnknownBehavior("behavior", asked.behavior, f"must be one of {', '.join(behaviors)}")
+    behaviors, behavior = SIMULATOR_BEHAVIORS[simulator], asked.behavior or DEFAULT_BEHAVIORS[simulator]
+    if behavior not in behaviors:
+        raise UnknownBehavior("behavior", behavior, f"must be one of {', '.join(behaviors)}")
     if asked.labels is not None:
-        _check_labels(project)
-    return jobs.enqueue(session, project.id, Collect(collection=asked), project.id, now, max_attempts)
+        _check_labels(project, asked.labels)
+    chosen = asked.model_copy(update={"behavior": behavior})  # what a worker does is decided when it is asked
+    return jobs.enqueue(session, project.id, Collect(collection=chosen), project.id, now, max_attempts)
 
 
-def _check_labels(project: ProjectRow) -> None:
+def _check_labels(project: ProjectRow, asked: CollectionLabels) -> None:
     """Counting effective steps by action needs single steps and countable actions."""
-    if not isinstance(projects.spaces_of(project).actions, DiscreteActions) or project.segment_length != 1:
-        raise InvalidField(
-            "labels.per_action", project.segment_length, "needs discrete actions and segments of length 1"
-        )
+    actions = projects.spaces_of(project).actions
+    if not isinstance(actions, DiscreteActions):
+        reason = f"needs discrete actions to count by, and this project's are boxes of shape {list(actions.shape)}"
+        raise InvalidField("labels.per_action", asked.per_action, reason)
+    if project.segment_length != 1:
+        raise InvalidField("labels.per_action", project.segment_length, "needs segments of length 1")

@@ -5,9 +5,10 @@ The actions are known only while the behavior runs. They are not stored, except 
 
 import json
 from collections.abc import Iterator
+from contextlib import closing
 
 from api_schemas.collections import CollectionCreate
-from api_schemas.environments import DiscreteActions
+from api_schemas.environments import DEFAULT_BEHAVIORS, DiscreteActions
 from api_schemas.labels import LabelSource, LabelsRequest
 from service import labels, pool, projects
 from service.errors import NoProvenance
@@ -18,7 +19,7 @@ from service.store.queries import pool as pool_queries
 from service.store.tables import ProjectRow
 from workers.episodes import Episode, Quota, new_episodes
 from workers.job import RunningJob
-from workers.simulators.base import Behavior, Simulator
+from workers.simulators.base import Simulator
 from workers.simulators.catalog import make_behavior, make_simulator
 
 BATCH = 25  # trajectories a transaction
@@ -31,11 +32,20 @@ def run_collection(job: RunningJob, asked: CollectionCreate, provenance: Provena
     with job.worker.database.read() as session:
         project = projects.find(session, asked.project)
     environment = projects.environment_of(project)
-    simulator = make_simulator(environment.simulator or "", environment.options)
-    behavior = make_behavior(asked.behavior, simulator)
+    with closing(make_simulator(environment.simulator or "", environment.options)) as simulator:
+        return _collect(job, project, asked, simulator, provenance)
+
+
+def _collect(
+    job: RunningJob,
+    project: ProjectRow,
+    asked: CollectionCreate,
+    simulator: Simulator,
+    provenance: ProvenanceBlobs,
+) -> dict[str, object]:
     quota = _quota(project, asked, simulator)
     collected, done, batch = 0, 0, []
-    for episode in _new_episodes(job, project, asked, simulator, behavior):
+    for episode in _new_episodes(job, project, asked, simulator):
         batch.append((episode, quota.take(episode)))
         collected, done = collected + 1, done + episode.transitions
         job.report(min(1.0, done / asked.transitions), f"collected {done} of {asked.transitions} transitions")
@@ -45,14 +55,14 @@ def run_collection(job: RunningJob, asked: CollectionCreate, provenance: Provena
         if quota.met:
             break
     _store(job, project, asked, batch, provenance)
-    simulator.close()
     return {"trajectories": collected, "transitions": done, "labels": dict(quota.taken), "short_of": quota.missing()}
 
 
 def _new_episodes(
-    job: RunningJob, project: ProjectRow, asked: CollectionCreate, simulator: Simulator, behavior: Behavior
+    job: RunningJob, project: ProjectRow, asked: CollectionCreate, simulator: Simulator
 ) -> Iterator[Episode]:
     """Episodes that neither were drawn before nor are in the other split already."""
+    behavior = make_behavior(_behavior(project, asked), simulator)
 
     def known(episode: Episode) -> bool:
         return _in_other_split(job, project, asked, codec.content_id(episode.observations))
@@ -60,7 +70,11 @@ def _new_episodes(
     def tell(left: int, repeats: int) -> None:
         job.report(1 - left / asked.transitions, f"{repeats} episodes in a row were known before")
 
-    return new_episodes(simulator, behavior, asked.transitions, asked.seed, known, tell)
+    return new_episodes(simulator, behavior, asked.transitions, asked.seed, known, tell, job.go_on)
+
+
+def _behavior(project: ProjectRow, asked: CollectionCreate) -> str:
+    return asked.behavior or DEFAULT_BEHAVIORS[projects.environment_of(project).simulator or ""]
 
 
 def _quota(project: ProjectRow, asked: CollectionCreate, simulator: Simulator) -> Quota:
@@ -89,7 +103,7 @@ def _store(
         trajectory = pool.store(job.worker.blobs, spaces, episode.observations, f"episode {episode.seed}")
         stored.append((trajectory, _store_provenance(provenance, project, asked, episode), episode, starts))
         job.go_on()
-    request = LabelsRequest(project=project.id, source=LabelSource(kind="simulator", name=asked.behavior))
+    request = LabelsRequest(project=project.id, source=LabelSource(kind="simulator", name=_behavior(project, asked)))
     with job.transaction() as session:
         pool.keep(session, [trajectory for trajectory, *_ in stored], job.now())
         row = projects.find(session, project.id, lock=True)
@@ -110,8 +124,9 @@ def _store_provenance(
     metadata = {
         "simulator": environment.simulator,
         "options": environment.options,
-        "behavior": asked.behavior,
+        "behavior": _behavior(project, asked),
         "seed": episode.seed,
+        "generator": episode.generator,
     }
     data = codec.encode(episode.states, {"metadata": json.dumps(metadata)})
     return provenance.put("provenance", data)

@@ -17,12 +17,17 @@ REPEATS = 1000  # episodes in a row that were seen before: the simulator has not
 
 @dataclass(frozen=True)
 class Episode:
-    """Observations and states (T + 1, ...), and the T actions that led through them."""
+    """Observations and states (T + 1, ...), and the T actions that led through them.
+
+    actions: integers of a discrete space, or arrays of a box. seed: the simulator's. generator: the state of the
+    behavior's generator when the episode began, as numpy tells it.
+    """
 
     observations: dict[str, NDArray[Any]]
     states: dict[str, NDArray[Any]]
-    actions: list[int]
+    actions: list[Any]
     seed: int
+    generator: dict[str, Any]
 
     @property
     def transitions(self) -> int:
@@ -43,17 +48,19 @@ def new_episodes(
     seed: int,
     known: Callable[[Episode], bool] = lambda episode: False,
     on_repeat: Callable[[int, int], None] = lambda left, repeats: None,
+    on_step: Callable[[], None] = lambda: None,
 ) -> Iterator[Episode]:
     """Episodes of `transitions` transitions in all, decided by the seed; none twice, and none that is `known`.
 
     Ends early where the simulator has nothing new to show. on_repeat: told the transitions left and how many episodes
-    in a row were seen before; may raise to stop.
+    in a row were seen before. on_step: called after every step, as a robot's episode takes long. Both may raise to
+    stop.
     """
     rng = np.random.default_rng(seed)
     seen: set[bytes] = set()
     left, repeats = transitions, 0
     while left > 0 and repeats < REPEATS:
-        episode = _episode(simulator, behavior, rng, left)
+        episode = _episode(simulator, behavior, rng, left, on_step)
         digest = _digest(episode)
         if digest in seen or known(episode):
             repeats += 1
@@ -68,7 +75,7 @@ class Quota:
     """How many effective transitions of each action are still to be labeled.
 
     A transition is effective when its action alone explains it: what happens by itself, like a flickering tile, has
-    every idle action as an explanation.
+    every idle action as an explanation. Nothing is counted where no labels are asked for, as of boxes none can be.
     """
 
     def __init__(self, simulator: Simulator, names: Sequence[str], per_action: int) -> None:
@@ -87,6 +94,8 @@ class Quota:
 
     def take(self, episode: Episode) -> list[int]:
         """Starts of the transitions of this episode to label: effective ones of actions that are still wanted."""
+        if not self.per_action:
+            return []
         starts = []
         for start, action in enumerate(episode.actions):
             name = self._names[action]
@@ -96,21 +105,24 @@ class Quota:
         return starts
 
 
-def _episode(simulator: Simulator, behavior: Behavior, rng: np.random.Generator, most: int) -> Episode:
+def _episode(
+    simulator: Simulator, behavior: Behavior, rng: np.random.Generator, most: int, on_step: Callable[[], None]
+) -> Episode:
     """The next episode, cut after `most` transitions so that a collection is as long as was asked for."""
-    seed = int(rng.integers(2**31))
+    seed, generator = int(rng.integers(2**31)), dict(rng.bit_generator.state)
     observations, states = [simulator.reset(seed)], [simulator.state()]
-    actions: list[int] = []
+    actions: list[Any] = []
     behavior.reset(rng)
     while len(actions) < most:
         action = behavior.act(simulator, rng)
         step = simulator.step(action)
         observations.append(step.observation)
         states.append(simulator.state())
-        actions.append(int(action))
+        actions.append(int(action) if np.ndim(action) == 0 else action)
+        on_step()
         if step.terminated or step.truncated:
             break
-    return Episode(_stacked(observations), _stacked(states), actions, seed)
+    return Episode(_stacked(observations), _stacked(states), actions, seed, generator)
 
 
 def _digest(episode: Episode) -> bytes:

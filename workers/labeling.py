@@ -1,55 +1,35 @@
 """The labeling worker: a simulator answers an acquisition, over HTTP like any other labeler.
 
 It restores the state in which a segment was observed and steps the simulator to find which actions reproduce what was
-observed next; or, to explore, executes there the actions that it is told. No stored action is read: none is stored.
+observed next (how: `explainers`); or, to explore, executes there the actions that it is told. No stored action is read:
+none is stored.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from datetime import UTC, datetime
+from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from api_schemas.acquisitions import Acquisition, AcquisitionItem
 from api_schemas.labels import Action, LabeledTrajectory, LabelItem, LabelsAccepted, LabelSource
 from api_schemas.projects import Project
 from asim.arrays import pack
 from asim.client import Client
-from asim.errors import ServiceError, Unavailable
+from asim.errors import NotFound, ServiceError, Unavailable
 from workers.delivery import Answer, Delivery
-from workers.explanation import explain
+from workers.explainers import Explainer, explainer_of
 from workers.lease import Clock, Lease, lost
-from workers.simulators.base import Observation, Simulator, State
+from workers.recording import Arrays, Known, Provenance, Recording
+from workers.simulators.base import Observation, Simulator, SimulatorError, State
 from workers.simulators.catalog import make_simulator
+from workers.unanswerable import EndedEarly, SimulatorFailed, UnanswerableItem, UnexplainedStep
 
 Progress = Callable[[int, int], None]
 NOTES = 10  # of what was refused, told besides the first
-
-
-class UnanswerableItem(ValueError):
-    """The simulator has no answer to an item."""
-
-
-class UnexplainedStep(UnanswerableItem):
-    """No action of the simulator leads from a segment's state to its next observation."""
-
-    def __init__(self, item: AcquisitionItem, step: int, residual: float) -> None:
-        super().__init__(
-            f"segment {item.trajectory}:{item.start}, step {step}: no action reproduces the observation; "
-            f"the nearest one is off by {residual:g}"
-        )
-
-
-class EndedEarly(UnanswerableItem):
-    """An exploration's episode ended before it was a segment long."""
-
-    def __init__(self, item: AcquisitionItem, executed: int, needed: int) -> None:
-        super().__init__(
-            f"item {item.rank}, explored from {item.trajectory}:{item.start}: the episode ended after {executed} "
-            f"transitions, a segment of this project needs {needed}"
-        )
+KNOWN = 200  # labels that a search's first guesses are fitted on
 
 
 def run_labeling(
@@ -75,14 +55,17 @@ def run_labeling(
     lease, answers = Lease(client, acquisition, clock), list[Answer]()
     refused: list[UnanswerableItem | ServiceError] = []
     with closing(make_simulator(environment.simulator, environment.options)) as simulator:
+        explainer = _explainer(client, project, simulator)
         for done, item in enumerate(acquisition.items, 1):
             lease.keep()
             try:
-                answers.append(_answer(client, project, acquisition, simulator, item, generator))
+                answers.append(_answer(client, project, simulator, explainer, item, generator))
             except Unavailable:
                 raise  # that is not the item's fault: all of them can be answered later
             except (UnanswerableItem, ServiceError) as error:
                 refused.append(error)
+            except SimulatorError as error:
+                refused.append(SimulatorFailed(item, error))
             if progress is not None:
                 progress(done, len(acquisition.items))
         source = LabelSource(kind="simulator", name=type(simulator).__name__)
@@ -103,73 +86,99 @@ def _first(refused: Sequence[Exception]) -> Exception:
     return refused[0]
 
 
+def _explainer(client: Client, project: Project, simulator: Simulator) -> Explainer:
+    def provenance(trajectory: str) -> Provenance:
+        return Provenance(*client.provenance(project.id, trajectory))
+
+    def known() -> Iterator[Known]:
+        for label in islice(client.labels(project.id), KNOWN):
+            with suppress(NotFound):  # of the states of recordings that came from elsewhere
+                yield Known(_recording(client, project, label.trajectory, label.start), label.actions)
+
+    return explainer_of(simulator, provenance, known)
+
+
+def _recording(client: Client, project: Project, trajectory: str, start: int) -> Recording:
+    content = client.trajectory_content(project.id, trajectory, start, project.segment_length)
+    states, _ = client.provenance(project.id, trajectory, start, project.segment_length)
+    return Recording(trajectory, start, content, states)
+
+
 def _answer(
     client: Client,
     project: Project,
-    acquisition: Acquisition,
     simulator: Simulator,
+    explainer: Explainer,
     item: AcquisitionItem,
     generator: np.random.Generator,
 ) -> Answer:
     if item.actions is not None:
-        return _explore(client, project, simulator, item, item.actions)
-    return _label(client, acquisition, simulator, item, generator)
+        return _explore(client, project, simulator, explainer, item, item.actions)
+    return _label(client, project, explainer, item, generator)
 
 
 def _label(
-    client: Client,
-    acquisition: Acquisition,
-    simulator: Simulator,
-    item: AcquisitionItem,
-    generator: np.random.Generator,
+    client: Client, project: Project, explainer: Explainer, item: AcquisitionItem, generator: np.random.Generator
 ) -> LabelItem:
-    content = client.trajectory_content(acquisition.project, item.trajectory, item.start, item.length)
-    states, _ = client.provenance(acquisition.project, item.trajectory, item.start, item.length)
-    sets, worst = [], 0.0
-    for step, (state, observed) in enumerate(_steps(states, content, item.length)):
-        actions, residual = explain(simulator, state, observed)
-        if not actions:
-            raise UnexplainedStep(item, step, residual)
-        sets.append(actions)
-        worst = max(worst, residual)
-    drawn = [int(generator.choice(actions)) for actions in sets]
+    recording = _recording(client, project, item.trajectory, item.start)
+    sets, worst = list[list[Action]](), 0.0
+    for step in range(item.length):
+        found = explainer.explain(recording, step)
+        if not found.actions:
+            raise UnexplainedStep(item, step, found)
+        sets.append(found.actions)
+        worst = max(worst, found.residual)
     return LabelItem(
-        trajectory=item.trajectory, start=item.start, actions=list(drawn), action_sets=sets, residual=worst
+        trajectory=item.trajectory,
+        start=item.start,
+        actions=[actions[int(generator.integers(len(actions)))] for actions in sets],
+        action_sets=_action_sets(explainer, sets),
+        residual=worst,
     )
 
 
 def _explore(
-    client: Client, project: Project, simulator: Simulator, item: AcquisitionItem, actions: Sequence[Action]
+    client: Client,
+    project: Project,
+    simulator: Simulator,
+    explainer: Explainer,
+    item: AcquisitionItem,
+    actions: Sequence[Action],
 ) -> LabeledTrajectory:
     """What is observed when the actions are executed from the item's observation on, up to the episode's end."""
     states, _ = client.provenance(project.id, item.trajectory, item.start, 1)
     simulator.restore({name: array[0] for name, array in states.items()})
-    before, seen = list[State](), [simulator.observe()]
+    passed, seen = [simulator.state()], [simulator.observe()]
     for action in actions:
-        before.append(simulator.state())
         step = simulator.step(action if isinstance(action, int) else np.asarray(action))
+        passed.append(simulator.state())
         seen.append(step.observation)
         if step.terminated or step.truncated:
             break
-    executed = list(actions[: len(before)])
+    executed = list(actions[: len(seen) - 1])
     if len(executed) < project.segment_length:  # the service would refuse it, and with it the request that it is in
         raise EndedEarly(item, len(executed), project.segment_length)
+    recording = Recording(item.trajectory, item.start, _stacked(seen), _stacked(passed))
     sets = []
-    for number, (state, observed, action) in enumerate(zip(before, seen[1:], executed, strict=True)):
-        explaining, residual = explain(simulator, state, observed)
-        if action not in explaining:  # the simulator does not repeat itself
-            raise UnexplainedStep(item, number, residual)
-        sets.append(explaining)
-    content = pack({name: np.stack([each[name] for each in seen]) for name in seen[0]})
+    for number, action in enumerate(executed):
+        found = explainer.confirm(recording, number, action)
+        if not found.actions:  # the simulator does not repeat itself
+            raise UnexplainedStep(item, number, found)
+        sets.append(found.actions)
     # Base64Bytes is given encoded bytes and holds decoded ones: constructing skips that round trip.
     return LabeledTrajectory.model_construct(
-        content=content, actions=executed, action_sets=sets, split="pool", rank=item.rank
+        content=pack(recording.observations),
+        actions=executed,
+        action_sets=_action_sets(explainer, sets),
+        split="pool",
+        rank=item.rank,
     )
 
 
-def _steps(
-    states: dict[str, NDArray[Any]], content: dict[str, NDArray[Any]], length: int
-) -> Iterator[tuple[State, Observation]]:
-    """(state before, observation after) of each of a segment's steps."""
-    for step in range(length):
-        yield {name: array[step] for name, array in states.items()}, {n: a[step + 1] for n, a in content.items()}
+def _action_sets(explainer: Explainer, sets: Sequence[list[Any]]) -> list[list[int]] | None:
+    """Only where they hold all actions that explain a step."""
+    return list(sets) if explainer.is_exhaustive else None
+
+
+def _stacked(steps: Sequence[Observation | State]) -> Arrays:
+    return {name: np.stack([step[name] for step in steps]) for name in steps[0]}

@@ -77,7 +77,8 @@ class ProjectCalls(Calls):
     def provenance(
         self, project: Id, trajectory: str, start: int | None = None, length: int | None = None
     ) -> tuple[Arrays, dict[str, object]]:
-        """Simulator states of the same rows, and how they came about: simulator, options, behavior, seed."""
+        """Simulator states of the same rows, and how they came about: simulator, options, behavior, seed,
+        and the generator that the behavior began with."""
         path = f"/trajectories/{trajectory}/provenance"
         states = unpack(self._bytes(path, project=project, start=start, length=length))
         return states, json.loads(str(states.pop("__metadata__")))

@@ -103,11 +103,12 @@ def collect(
     project: ProjectName,
     *,
     transitions: Annotated[int, typer.Option(min=1, help="Transitions to collect.")],
-    behavior: Annotated[str, typer.Option(help="mixture, random, balanced, or a solver's name.")] = "mixture",
+    behavior: Annotated[str | None, typer.Option(help="random, expert, ...; default the simulator's own.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of layouts and actions.")] = 0,
     split: Split = "auto",
     labels_per_action: Annotated[
-        int | None, typer.Option(min=1, help="Record the labels of so many effective transitions of each action.")
+        int | None,
+        typer.Option(min=1, help="Record labels of so many effective transitions of each action (discrete ones)."),
     ] = None,
     url: Url = DEFAULT_URL,
     key: Key = None,

@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from workers.simulators.base import OptionError
-from workers.simulators.catalog import behavior_names, make_behavior, make_simulator
+from workers.simulators.catalog import SIMULATORS, behavior_names, make_behavior, make_simulator
 
 
 def test_an_unknown_simulator_is_named_beside_the_known_ones() -> None:
@@ -77,3 +78,11 @@ def test_the_catalog_imports_no_simulator_package_and_simulators_nothing_of_the_
     done = subprocess.run([sys.executable, "-c", code], check=False, timeout=60, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""  # pygame's greeting would end up in a worker's output
+
+
+def test_nothing_that_collects_labels_or_serves_knows_a_simulator_by_name() -> None:
+    root = Path(__file__).parents[2]
+    sources = [*(root / "workers").glob("*.py"), *(root / "service").rglob("*.py"), *(root / "asim/calls").glob("*.py")]
+    assert len(sources) > 50
+    named = [(path.name, name) for path in sources for name in SIMULATORS if name in path.read_text().lower()]
+    assert named == []

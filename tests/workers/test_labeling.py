@@ -18,10 +18,11 @@ from tests.workers.conftest import ROOM, OpenLoop, new_project
 from tests.workers.in_process import Loop, segments_of
 from workers import delivery, labeling
 from workers.explanation import explain
-from workers.labeling import EndedEarly, UnexplainedStep, run_labeling
+from workers.labeling import run_labeling
 from workers.simulators.base import Simulator
 from workers.simulators.catalog import make_simulator
 from workers.simulators.minigrid import ACTION_NAMES, DROP, NOTHING
+from workers.unanswerable import EndedEarly, UnexplainedStep
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -279,10 +280,12 @@ def _end_episodes(monkeypatch: pytest.MonkeyPatch, batch: Acquisition, rank: int
     """The episode that this item explores in is over after so many steps."""
     explore = labeling._explore
 
-    def cut(client: Client, project: Any, simulator: Simulator, item: AcquisitionItem, actions: Any) -> Any:
+    def cut(
+        client: Client, project: Any, simulator: Simulator, explainer: Any, item: AcquisitionItem, told: Any
+    ) -> Any:
         if item.rank == rank:
             simulator = Cut(simulator, after)
-        return explore(client, project, simulator, item, actions)
+        return explore(client, project, simulator, explainer, item, told)
 
     monkeypatch.setattr(labeling, "_explore", cut)
 

@@ -20,11 +20,13 @@ An episode, recorded so that any of its steps can be replayed later:
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
+
+from workers.simulators.search_settings import SearchSettings
 
 Observation = dict[str, NDArray[Any]]
 """Named streams, e.g. images and proprioception, each with the shape and dtype of its entry in `observation_space`."""
@@ -93,6 +95,25 @@ class Simulator(Protocol):
 
     def close(self) -> None:
         """Frees what the simulator holds; harmless when repeated."""
+
+
+@runtime_checkable
+class SearchableSimulator(Simulator, Protocol):
+    """A simulator whose actions are boxes, and of which the action behind a recorded step can be searched for."""
+
+    @property
+    def search(self) -> SearchSettings:
+        """What a search has to know."""
+
+    def advance(self, action: Action) -> None:
+        """`step` without looking: pictures are most of its cost."""
+
+    def numbers(self) -> Observation:
+        """The streams of `observe` that are no pictures."""
+
+    def motion(self) -> NDArray[np.float64]:
+        """What the robot does at present, (m,), each number in units in which 1 is much; an action changes it
+        gradually."""
 
 
 class Behavior(Protocol):

@@ -20,12 +20,14 @@ from workers.simulators.base import (
     Step,
 )
 from workers.simulators.maniskill_env import TASKS, make_env
-from workers.simulators.robot_behaviors import RandomBehavior
+from workers.simulators.robot_behaviors import NoisyBehavior, RandomBehavior
 from workers.simulators.robot_observation import ACTION_SPACE, checked_action
 from workers.simulators.robot_options import RobotOptions
 from workers.simulators.robot_progress import Progress
+from workers.simulators.search_settings import SearchSettings
 from workers.simulators.waypoints import ExpertBehavior
 
+SEARCH = SearchSettings(continuous=7, grips=(0.0,))
 NAME = "maniskill"
 HORIZONS = {name: task.horizon for name, task in TASKS.items()}
 
@@ -70,6 +72,11 @@ class ManiSkillSimulator:
 
     def step(self, action: Action) -> Step:
         """Raises SimulatorError for an action outside the space, and where the simulation breaks down."""
+        self.advance(action)
+        return Step(self.observe(), self._progress.terminated, self._progress.truncated)
+
+    def advance(self, action: Action) -> None:
+        """`step` without an observation."""
         told = self.env.step(checked_action(action))[4]
         self._progress.advance(bool(told["success"]))
         try:
@@ -79,15 +86,27 @@ class ManiSkillSimulator:
                 f"Simulator {NAME!r}, task {self.options.task!r}, broke down in step {self._progress.steps} of an "
                 f"episode: {error}"
             ) from error
-        return Step(self.observe(), self._progress.terminated, self._progress.truncated)
 
     def observe(self) -> Observation:
         """The current observation, in new arrays."""
+        return {**self.view.images(), **self.numbers()} if self.options.cameras else self.numbers()
+
+    def numbers(self) -> Observation:
+        """The current observation but for its images."""
         arm = robot_observation.proprioception(self.view.grip(), self.view.fingers())
         if self.options.cameras:
-            return {**self.view.images(), "proprioception": arm}
+            return {"proprioception": arm}
         objects = map(self.view.body, TASKS[self.options.task].objects)
         return {"proprioception": arm, "objects": robot_observation.objects(objects)}
+
+    @property
+    def search(self) -> SearchSettings:
+        """SEARCH."""
+        return SEARCH
+
+    def motion(self) -> NDArray[np.float64]:
+        """See `search_settings.motion`: (18,)."""
+        return self._access.motion()
 
     def render(self) -> NDArray[np.uint8]:
         """What the front camera sees, (256, 256, 3)."""
@@ -106,6 +125,7 @@ def make_simulator(options: Mapping[str, object]) -> Simulator:
 
 _FACTORIES: dict[str, Callable[[], Behavior]] = {
     "expert": lambda: ExpertBehavior(maniskill_experts.plan),
+    "noisy_expert": lambda: NoisyBehavior(ExpertBehavior(maniskill_experts.plan)),
     "random": RandomBehavior,
 }
 BEHAVIORS = tuple(_FACTORIES)

@@ -15,11 +15,12 @@ from workers.simulators.base import State, StateError, check_finite, check_state
 from workers.simulators.maniskill_env import TASKS
 from workers.simulators.robot_packages import load, versions
 from workers.simulators.robot_progress import Progress
+from workers.simulators.search_settings import motion
 
 sapien: Any = load("sapien")
 
 PACKAGES = ("mani_skill", "sapien")
-JOINTS = 9
+JOINTS, ARM = 9, 7
 
 
 class StateAccess:
@@ -81,6 +82,11 @@ class StateAccess:
         self._state = {"joints": joints, "objects": bodies, "version": self._version}
         check_finite(self._state)
         self._settle()
+
+    def motion(self) -> NDArray[np.float64]:
+        """(18,): see `search_settings.motion`."""
+        positions, velocities, targets = self._state["joints"]
+        return motion(positions[:ARM], velocities[:ARM], positions[ARM:], targets[ARM:])
 
     def _settle(self) -> None:
         """Puts the bodies into an empty scene, in the arrangement of the state."""

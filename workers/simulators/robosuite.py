@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from workers.simulators import robosuite_experts, robot_observation
 from workers.simulators.base import Action, Behavior, Observation, OptionError, Simulator, SimulatorError, State, Step
 from workers.simulators.robosuite_env import TASKS, make_env
-from workers.simulators.robot_behaviors import RandomBehavior
+from workers.simulators.robot_behaviors import NoisyBehavior, RandomBehavior
 from workers.simulators.robot_observation import ACTION_SPACE, checked_action
 from workers.simulators.robot_options import RobotOptions
 from workers.simulators.robot_progress import Progress
+from workers.simulators.search_settings import SearchSettings
 from workers.simulators.waypoints import ExpertBehavior
 
+SEARCH = SearchSettings(continuous=6, grips=(-1.0, 1.0))  # of the gripper's number only the sign counts
 NAME = "robosuite"
 HORIZONS = {name: task.horizon for name, task in TASKS.items()}
 
@@ -61,6 +63,11 @@ class RobosuiteSimulator:
 
     def step(self, action: Action) -> Step:
         """Raises SimulatorError for an action outside the space, and where the simulation breaks down."""
+        self.advance(action)
+        return Step(self.observe(), self._progress.terminated, self._progress.truncated)
+
+    def advance(self, action: Action) -> None:
+        """`step` without an observation."""
         self.env.step(checked_action(action).astype(np.float64))
         self._progress.advance(bool(self.env._check_success()))
         if self._access.broke_down():
@@ -69,15 +76,27 @@ class RobosuiteSimulator:
                 f"{self._progress.steps} of an episode."
             )
         self.view.update()
-        return Step(self.observe(), self._progress.terminated, self._progress.truncated)
 
     def observe(self) -> Observation:
         """The current observation, in new arrays."""
+        return {**self.view.images(), **self.numbers()} if self.options.cameras else self.numbers()
+
+    def numbers(self) -> Observation:
+        """The current observation but for its images."""
         arm = robot_observation.proprioception(self.view.grip(), self.view.fingers())
         if self.options.cameras:
-            return {**self.view.images(), "proprioception": arm}
+            return {"proprioception": arm}
         bodies = map(self.view.body, TASKS[self.options.task].bodies)
         return {"proprioception": arm, "objects": robot_observation.objects(bodies)}
+
+    @property
+    def search(self) -> SearchSettings:
+        """SEARCH."""
+        return SEARCH
+
+    def motion(self) -> NDArray[np.float64]:
+        """See `search_settings.motion`: (18,)."""
+        return self._access.motion()
 
     def render(self) -> NDArray[np.uint8]:
         """What the front camera sees, (256, 256, 3)."""
@@ -96,6 +115,7 @@ def make_simulator(options: Mapping[str, object]) -> Simulator:
 
 _FACTORIES: dict[str, Callable[[], Behavior]] = {
     "expert": lambda: ExpertBehavior(robosuite_experts.plan),
+    "noisy_expert": lambda: NoisyBehavior(ExpertBehavior(robosuite_experts.plan)),
     "random": RandomBehavior,
 }
 BEHAVIORS = tuple(_FACTORIES)

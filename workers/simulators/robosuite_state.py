@@ -9,6 +9,7 @@ from workers.simulators.base import State, StateError, check_finite, check_state
 from workers.simulators.robosuite_env import TASKS, seed_env
 from workers.simulators.robot_packages import load, versions
 from workers.simulators.robot_progress import Progress
+from workers.simulators.search_settings import motion
 
 mujoco: Any = load("mujoco")
 
@@ -17,6 +18,7 @@ mujoco.set_mju_user_warning(lambda message: None)  # `broke_down` tells; else it
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 POSTURE, GOAL = slice(0, 7), slice(7, 10)  # the goal's rotation matrix follows
 CONTROLLER = 19
+OPENING = 0.02  # m of a finger's way for 1 of what the gripper is sent to
 PACKAGES = ("robosuite", "mujoco")
 BREAKDOWNS = [mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC]
 
@@ -86,6 +88,13 @@ class StateAccess:
     def broke_down(self) -> bool:
         """Whether a number was not finite since the last reset; MuJoCo itself then starts anew and only counts that."""
         return any(self._data.warning[kind].number for kind in BREAKDOWNS) or not np.isfinite(self._data.qpos).all()
+
+    def motion(self) -> NDArray[np.float64]:
+        """(18,): see `search_settings.motion`."""
+        robot, data = self._env.robots[0], self._data
+        fingers = data.qpos[robot._ref_gripper_joint_pos_indexes["right"]]
+        sent = OPENING * np.broadcast_to(self._gripper.current_action, 2)
+        return motion(data.qpos[robot._ref_joint_pos_indexes], data.qvel[robot._ref_joint_vel_indexes], fingers, sent)
 
     def _forward(self) -> None:
         """Derived quantities, without the warm start that computing them leaves behind."""

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.simulators.base import Simulator
+from workers.simulators.base import Behavior, Simulator
 from workers.simulators.robot_observation import ACTION_SPACE
 
 
@@ -17,3 +17,24 @@ class RandomBehavior:
         """Reads nothing of the simulator."""
         del simulator
         return rng.uniform(ACTION_SPACE.low, ACTION_SPACE.high).astype(np.float32)
+
+
+class NoisyBehavior:
+    """Another behavior's actions with Gaussian noise on all numbers but the gripper's. An episode's standard deviation
+    is drawn uniformly from 0 to LOUDEST, so that some episodes go well and some badly."""
+
+    LOUDEST = 0.6
+
+    def __init__(self, behavior: Behavior) -> None:
+        self._behavior, self._deviation = behavior, 0.0
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Draws how noisy the episode is."""
+        self._deviation = float(rng.uniform(0, self.LOUDEST))
+        self._behavior.reset(rng)
+
+    def act(self, simulator: Simulator, rng: np.random.Generator) -> NDArray[np.float32]:
+        """The other behavior's action and noise, within the action space."""
+        action = np.array(self._behavior.act(simulator, rng), np.float32)
+        action[:-1] += self._deviation * rng.standard_normal(len(action) - 1)
+        return np.clip(action, ACTION_SPACE.low, ACTION_SPACE.high)

@@ -78,7 +78,7 @@ class Transition:
     @property
     def action(self) -> int:
         """The one that was taken."""
-        return self.episode.actions[self.start]
+        return int(self.episode.actions[self.start])
 
 
 def coverage(action: int, front: Code, carried: Code) -> Coverage:
