@@ -36,8 +36,6 @@ class RobotOptions:
             raise OptionError(f"Option 'cameras' must be true or false, but it is {cameras!r}.")
         if horizon is None:
             horizon = horizons[task]
-        if isinstance(horizon, float) and horizon.is_integer():
-            horizon = int(horizon)  # as JSON has it, and the API with it
         if type(horizon) is not int or not 1 <= horizon <= LONGEST:
             raise OptionError(f"Option 'horizon' must be an integer from 1 to {LONGEST}, but it is {horizon!r}.")
         return cls(task, cameras, horizon)
