@@ -40,6 +40,7 @@ def explain(error: Exception) -> str | None:
     if isinstance(error, AsimError):
         return str(error)
     from pydantic import ValidationError
+    from sqlalchemy.exc import SQLAlchemyError
 
     from service.errors import ServiceError as Refused  # of commands that work on the database itself
 
@@ -47,6 +48,8 @@ def explain(error: Exception) -> str | None:
         return "; ".join(_refused(".".join(map(str, each["loc"])), each["msg"]) for each in error.errors())
     if isinstance(error, Refused):
         return error.detail
+    if isinstance(error, SQLAlchemyError):
+        return f"the database: {str(error).partition(chr(10))[0]}"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return None

@@ -14,7 +14,7 @@ from typing import Any
 from uuid import UUID
 
 import zstandard
-from sqlalchemy import Connection, MetaData, Table, delete, func, insert, inspect, select, text
+from sqlalchemy import Connection, MetaData, Table, delete, func, insert, inspect, make_url, select, text
 from sqlalchemy.orm import Session
 
 import service.store.tables  # noqa: F401  # its rows are what the metadata holds
@@ -56,6 +56,7 @@ def load(folder: Path, url: str, revision: str, counts: Mapping[str, int]) -> No
 
     counts: rows by table. Raises NotEmpty, and UnreadableBackup where a file is not what `dump` wrote.
     """
+    _make_private(url)
     _bring_to(url, revision)
     with _written(url) as (connection, tables):
         for name in (name for name in tables if name in counts):
@@ -64,6 +65,13 @@ def load(folder: Path, url: str, revision: str, counts: Mapping[str, int]) -> No
             if written != counts[name]:
                 raise UnreadableBackup(name, f"has {written} rows, its manifest tells of {counts[name]}")
     migrate(url)
+
+
+def _make_private(url: str) -> None:
+    """A new SQLite file is this user's alone: hashes of keys and tokens of leases are in it."""
+    named = make_url(url)
+    if named.get_backend_name() == "sqlite" and named.database:
+        Path(named.database).touch(mode=0o600)
 
 
 def _bring_to(url: str, revision: str) -> None:
@@ -81,6 +89,7 @@ def _bring_to(url: str, revision: str) -> None:
 def copy(source: str, target: str) -> dict[str, int]:
     """All rows of one database into another, empty one; rows by table. Raises NotEmpty, NoDatabase."""
     check_newest(source)
+    _make_private(target)
     migrate(target)
     counts = {}
     with snapshot(source) as reading, _written(target) as (writing, _):

@@ -20,6 +20,7 @@ from service.store.blobs import Blobs
 from service.store.database import downgrade, migrate, newest_revision, open_database, revision_of
 from service.store.provenance import ProvenanceBlobs
 from service.store.tables import EventEpochRow, EventRow, KeyRow, MembershipRow
+from tests.command import Command
 from tests.servers import postgres_database
 from tests.service.access_table import fill
 from tests.service.kit import Served, answers, room, serve
@@ -244,6 +245,18 @@ def test_a_database_that_is_not_there_is_neither_copied_nor_made(tmp_path: Path)
         with pytest.raises(NoDatabase, match=reason):
             transfer.copy(source, target)
     assert [path.name for path in tmp_path.glob("*.db")] == ["old.db"]
+
+
+def test_a_copy_is_its_makers_alone(filled: Served, tmp_path: Path) -> None:
+    transfer.copy(url_of(filled), f"sqlite:///{tmp_path / 'copy.db'}")
+    assert (tmp_path / "copy.db").stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("source", ["data/asim.db", "sqlit:///x.db", "postgresql+psycopg://127.0.0.1:1/x"])
+def test_a_url_that_leads_nowhere_is_a_sentence(command: Command, tmp_path: Path, source: str) -> None:
+    told = command("db", "copy", source, f"sqlite:///{tmp_path / 'copy.db'}", status=1)
+    assert "the database" in told
+    assert "Traceback" not in told
 
 
 def test_a_blob_that_is_missing_is_named_and_the_rest_is_in_the_backup(filled: Served, tmp_path: Path) -> None:
