@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import structlog
 from sqlalchemy import delete
 
 from service.settings import Settings
@@ -25,16 +24,6 @@ Serve = Callable[..., Served]
 def _no_settings_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in os.environ if name.startswith("ASIM_") and not name.startswith("ASIM_TEST_")]:
         monkeypatch.delenv(name)
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _short_logs() -> Iterator[None]:
-    """A failed job's traceback with all its local variables takes seconds to print."""
-    structlog.configure(
-        processors=[structlog.processors.format_exc_info, structlog.processors.KeyValueRenderer(key_order=["event"])]
-    )
-    yield
-    structlog.reset_defaults()
 
 
 @pytest.fixture(scope="session")

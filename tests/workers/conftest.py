@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import structlog
 import torch
 
 from api_schemas.environments import Environment
@@ -45,14 +44,6 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture(autouse=True, scope="package")
-def _plain_logs() -> Iterator[None]:
-    """The default console renderer takes seconds for a traceback."""
-    structlog.configure([structlog.processors.format_exc_info, structlog.processors.KeyValueRenderer()])
-    yield
-    structlog.reset_defaults()
 
 
 @pytest.fixture(autouse=True, scope="package")
