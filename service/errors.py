@@ -323,40 +323,6 @@ class BodyTooLarge(ServiceError):
     status_code = 413
 
 
-class NoDatabase(ServiceError):
-    """There is no database, or it is of another version."""
-
-    status_code = 409
-
-    def __init__(self, url: str, reason: str) -> None:
-        super().__init__(f"the database {url} {reason}")
-
-
-class NotEmpty(ServiceError):
-    """Rows can be written to an empty database only."""
-
-    status_code = 409
-
-    def __init__(self, table: str) -> None:
-        super().__init__(f"the database holds rows of {table} already; name one that is empty, or new")
-
-
-class BackupExists(ServiceError):
-    """A backup does not write over another."""
-
-    status_code = 409
-
-    def __init__(self, folder: str) -> None:
-        super().__init__(f"{folder} is not empty; name a folder that is not there yet")
-
-
-class UnreadableBackup(ServiceError):
-    """A backup is damaged, or is none."""
-
-    def __init__(self, name: str, reason: str) -> None:
-        super().__init__(f"{name} {reason}; no row was restored")
-
-
 class JobFinished(ServiceError):
     """A job that has ended cannot be cancelled."""
 

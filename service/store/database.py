@@ -16,8 +16,8 @@ from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from service.errors import NoDatabase
 from service.settings import POOL_SIZE
+from service.store.errors import NoDatabase
 from service.store.queries.events import keep_order
 
 SQLITE_WAITS = 15_000  # milliseconds

@@ -18,9 +18,9 @@ from sqlalchemy import Connection, MetaData, Table, delete, func, insert, inspec
 from sqlalchemy.orm import Session
 
 import service.store.tables  # noqa: F401  # its rows are what the metadata holds
-from service.errors import NotEmpty, UnreadableBackup
 from service.store.columns import Row
 from service.store.database import check_newest, downgrade, knows, migrate, open_database, revision_of
+from service.store.errors import NotEmpty, UnreadableBackup
 from service.store.queries.events import keep_order
 
 BATCH = 1000  # rows written at once

@@ -13,11 +13,11 @@ import zstandard
 from sqlalchemy import func, select
 
 from service.backup import MANIFEST, Manifest, TableFile, backup, read_manifest, restore
-from service.errors import BackupExists, NoDatabase, NotEmpty, UnreadableBackup
 from service.settings import Settings
 from service.store import transfer
 from service.store.blobs import Blobs
 from service.store.database import downgrade, migrate, newest_revision, open_database, revision_of
+from service.store.errors import BackupExists, NoDatabase, NotEmpty, UnreadableBackup
 from service.store.provenance import ProvenanceBlobs
 from service.store.tables import EventEpochRow, EventRow, KeyRow, MembershipRow
 from tests.command import Command

@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.simulators.base import State, StateError, check_finite, check_state
+from workers.simulators.base import State, check_finite, check_state
 from workers.simulators.maniskill_env import TASKS
-from workers.simulators.robot_packages import load, versions
+from workers.simulators.robot_packages import check_version, load, versions
 from workers.simulators.robot_progress import Progress
 from workers.simulators.search_settings import motion
 
 sapien: Any = load("sapien")
 
 PACKAGES = ("mani_skill", "sapien")
+NAMES = ("ManiSkill", "SAPIEN")
 JOINTS, ARM = 9, 7
 
 
@@ -59,8 +60,7 @@ class StateAccess:
         """Raises StateError for a state of another task or version, or with a number that is none."""
         check_state(state, self.expected)
         check_finite(state)
-        if not np.array_equal(state["version"], self._version):
-            raise StateError(f"State 'version' is of {_told(state['version'])}, but this is {_told(self._version)}.")
+        check_version(state["version"], self._version, list(TASKS), NAMES)
         self._state = {name: array.copy() for name, array in state.items()}
         self._progress.write(state["progress"])
         self._settle()
@@ -117,13 +117,3 @@ def _write(body: Any, row: NDArray[np.float32]) -> None:
     if not body.kinematic:  # goals are moved by hand and have no velocity
         body.set_linear_velocity(row[7:10])
         body.set_angular_velocity(row[10:])
-
-
-def _told(version: NDArray[np.int64]) -> str:
-    task, *numbers = version.tolist()
-    name = list(TASKS)[task] if 0 <= task < len(TASKS) else f"number {task}"
-    return f"task {name} in ManiSkill {_dotted(numbers[:3])} with SAPIEN {_dotted(numbers[3:])}"
-
-
-def _dotted(numbers: list[int]) -> str:
-    return ".".join(map(str, numbers))

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.simulators.base import State, StateError, check_finite, check_state
+from workers.simulators.base import State, check_finite, check_state
 from workers.simulators.robosuite_env import TASKS, seed_env
-from workers.simulators.robot_packages import load, versions
+from workers.simulators.robot_packages import check_version, load, versions
 from workers.simulators.robot_progress import Progress
 from workers.simulators.search_settings import motion
 
@@ -20,6 +20,7 @@ POSTURE, GOAL = slice(0, 7), slice(7, 10)  # the goal's rotation matrix follows
 CONTROLLER = 19
 OPENING = 0.02  # m of a finger's way for 1 of what the gripper is sent to
 PACKAGES = ("robosuite", "mujoco")
+NAMES = ("robosuite", "MuJoCo")
 BREAKDOWNS = [mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC]
 
 
@@ -105,8 +106,7 @@ class StateAccess:
     def _check(self, state: State) -> None:
         check_state(state, self.expected)
         check_finite(state)
-        if not np.array_equal(state["version"], self._version):
-            raise StateError(f"State 'version' is of {_told(state['version'])}, but this is {_told(self._version)}.")
+        check_version(state["version"], self._version, list(TASKS), NAMES)
 
     @property
     def _arm(self) -> Any:
@@ -115,13 +115,3 @@ class StateAccess:
     @property
     def _gripper(self) -> Any:
         return self._env.robots[0].gripper["right"]
-
-
-def _told(version: NDArray[np.int64]) -> str:
-    task, *numbers = version.tolist()
-    name = list(TASKS)[task] if 0 <= task < len(TASKS) else f"number {task}"
-    return f"task {name} in robosuite {_dotted(numbers[:3])} with MuJoCo {_dotted(numbers[3:])}"
-
-
-def _dotted(numbers: list[int]) -> str:
-    return ".".join(map(str, numbers))

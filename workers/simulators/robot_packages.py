@@ -8,7 +8,7 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
@@ -17,7 +17,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.simulators.base import SimulatorUnavailable
+from workers.simulators.base import SimulatorUnavailable, StateError
 
 LOGGERS = ("robosuite_logs", "mani_skill ")  # the space is in ManiSkill's name
 WARNINGS: dict[str, type[Warning]] = {
@@ -55,6 +55,22 @@ def quiet() -> Iterator[None]:
 def versions(*names: str) -> NDArray[np.int64]:
     """The installed versions of packages, three numbers each, as a state carries them: (3 * len(names),)."""
     return np.array([int(number) for name in names for number in re.findall(r"\d+", version(name))[:3]], np.int64)
+
+
+def check_version(
+    found: NDArray[np.int64], expected: NDArray[np.int64], tasks: Sequence[str], names: Sequence[str]
+) -> None:
+    """Both: number of the task, then three numbers of each named package. Raises StateError where they differ."""
+    if not np.array_equal(found, expected):
+        told, own = (_told(version.tolist(), tasks, names) for version in (found, expected))
+        raise StateError(f"State 'version' is of {told}, but this is {own}.")
+
+
+def _told(version: list[int], tasks: Sequence[str], names: Sequence[str]) -> str:
+    number, *numbers = version
+    task = tasks[number] if 0 <= number < len(tasks) else f"number {number}"
+    dotted = (".".join(map(str, numbers[start : start + 3])) for start in range(0, len(numbers), 3))
+    return f"task {task} in {' with '.join(f'{name} {release}' for name, release in zip(names, dotted, strict=True))}"
 
 
 def _is_error(record: logging.LogRecord) -> bool:
