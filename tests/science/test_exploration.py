@@ -42,7 +42,7 @@ def subgoal_generator() -> GridSubgoalGenerator:
     generator = torch.Generator().manual_seed(2)
     model = GRID.build_subgoal_generator(toy_grid.SPACES, None, generator)
     seen = toy_grid.labeled(3000, seed=3).without_labels()
-    train(model, seen, TrainingConfig(250, 64, 5e-3, 1e-4), generator)
+    train(model, seen, TrainingConfig(400, 64, 5e-3, 1e-4), generator)
     return model
 
 
