@@ -43,7 +43,7 @@ serve: setup ## the service on ./asim-data at http://127.0.0.1:8000
 
 test: setup-robots lint types imports ## what CI runs: lint, types, import contracts, tests
 	scripts/system-packages all
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test-slow: setup ## the long tests: kills at random moments, scale (REPEAT=5 shortens the kills; ASIM_TEST_SEED=n repeats)
 	scripts/system-packages all

@@ -18,6 +18,8 @@ from sqlalchemy import create_engine
 from sqlalchemy.exc import OperationalError
 
 START_SECONDS = 30.0
+# An interrupted pytest-xdist ends its processes before their fixtures can end a server.
+END_WITH_TESTS = ["setpriv", "--pdeathsig", "INT"] if shutil.which("setpriv") else []
 
 
 class PrivateServer:
@@ -58,7 +60,12 @@ class PrivateServer:
         """Start on the data that is there, and wait until it answers."""
         with (self.folder / "log").open("ab") as log:
             self.process = subprocess.Popen(
-                self.command(), user=unprivileged_user(), cwd=self.folder, stdout=log, stderr=log, process_group=0
+                [*END_WITH_TESTS, *self.command()],
+                user=unprivileged_user(),
+                cwd=self.folder,
+                stdout=log,
+                stderr=log,
+                process_group=0,
             )
         wait_for(self.answers, self.name, self._ended)
 

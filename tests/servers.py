@@ -1,5 +1,6 @@
-"""Real PostgreSQL and Redis for tests: the server that a variable names, the one on its usual port, or a private one.
+"""Real PostgreSQL and Redis for tests: the server that a variable names, a private one, or that on its usual port.
 
+A private PostgreSQL comes before one that is there and waits for its disk: tests make and drop databases by the dozen.
 Where none can be had a test is skipped and says so; with CI set it fails instead.
 """
 
@@ -42,14 +43,15 @@ class RedisSpace:
 def postgres_server() -> Iterator[str]:
     """URL of a PostgreSQL server in which databases may be made."""
     asked = os.environ.get("ASIM_TEST_DATABASE_URL")
+    if not asked and postgres_folder() is not None:
+        with PrivatePostgres() as server:
+            yield server.url
+        return
     for url in (asked,) if asked else POSTGRES_URLS:
         if postgres_answers(url):
             yield url
             return
-    if asked or postgres_folder() is None:
-        _missing(f"PostgreSQL: {asked or POSTGRES_URLS[0]} does not answer, and no server is installed")
-    with PrivatePostgres() as server:
-        yield server.url
+    _missing(f"PostgreSQL: {asked or POSTGRES_URLS[0]} does not answer, and no server is installed")
 
 
 @pytest.fixture

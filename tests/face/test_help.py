@@ -1,5 +1,6 @@
 """asim --help answers at once, because nothing heavy is imported for it."""
 
+import json
 import os
 import subprocess
 import sys
@@ -47,17 +48,36 @@ COMMANDS: list[list[str]] = [
 ]
 
 
-@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_help_imports_nothing_heavy(command: list[str]) -> None:
-    program = (
-        "import sys\nfrom asim.cli import main\n"
-        f"sys.argv = ['asim', *{command!r}, '--help']\n"
-        "try:\n    main()\nexcept SystemExit as end:\n    assert end.code == 0, end.code\n"
-        f"print('heavy:', [name for name in {HEAVY!r} if name in sys.modules])"
-    )
-    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert "Usage: asim" in printed
-    assert printed.splitlines()[-1] == "heavy: []"
+PROGRAM = """
+import contextlib, io, json, sys
+from asim.cli import main
+commands, heavy = map(json.loads, sys.argv[1:])
+told = []
+for command in commands:
+    sys.argv, printed = ["asim", *command, "--help"], io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        try:
+            main()
+        except SystemExit as end:
+            assert end.code == 0, end.code
+    told.append((printed.getvalue(), [name for name in heavy if name in sys.modules]))
+print(json.dumps(told))
+"""
+
+
+@pytest.fixture(scope="module")
+def told() -> dict[str, tuple[str, list[str]]]:
+    """By command: its help, and what of HEAVY is imported by then; what one command imports, all after it have."""
+    argv = [sys.executable, "-c", PROGRAM, json.dumps(COMMANDS), json.dumps(HEAVY)]
+    printed = subprocess.run(argv, capture_output=True, text=True, check=True).stdout
+    return dict(zip(map(" ".join, COMMANDS), json.loads(printed), strict=True))
+
+
+@pytest.mark.parametrize("command", [" ".join(command) for command in COMMANDS])
+def test_help_imports_nothing_heavy(command: str, told: dict[str, tuple[str, list[str]]]) -> None:
+    printed, heavy = told[command]
+    assert f"Usage: asim {command}".strip() in printed
+    assert heavy == []
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """The client against the real service, over a wire that loses answers after the service has committed."""
 
+import shutil
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -48,7 +49,8 @@ class LossyWire(httpx.BaseTransport):
 
 
 @pytest.fixture
-def settings(tmp_path: Path) -> Settings:
+def settings(tmp_path: Path, migrated: Path) -> Settings:
+    shutil.copy(migrated, tmp_path / "asim.db")
     return Settings(data_folder=tmp_path)
 
 

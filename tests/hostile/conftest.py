@@ -16,11 +16,10 @@ from service.settings import Settings
 from service.store.database import migrate
 from tests.crash.deployment import Deployed
 from tests.loop.processes import eventually, free_port
-from tests.servers import RedisSpace, postgres_server, postgres_url, redis_server, redis_space
+from tests.servers import RedisSpace
 from tests.service.access_table import SCOPES, fill, holder
 from tests.service.kit import ROBOT, Json, serve
 
-__all__ = ["postgres_server", "postgres_url", "redis_server", "redis_space"]
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parents[1]
 KEPT = "use_after_free"  # nothing is gone after its DELETE: a job is listed as cancelled, and no key can be asked for

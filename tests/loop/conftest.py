@@ -7,10 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.loop.processes import Serving
-from tests.servers import redis_server, redis_space
 from tests.workers.conftest import new_project, open_loop
 
-__all__ = ["redis_server", "redis_space"]
 LEASE_SECONDS = "3"
 Serve = Callable[..., Serving]
 

@@ -13,9 +13,7 @@ from tests.loop.conftest import LEASE_SECONDS, Serve
 from tests.loop.invariants import check_invariants
 from tests.loop.labelers import PersistentLabeler
 from tests.loop.processes import Serving, environment, eventually
-from tests.servers import postgres_server, postgres_url
 
-__all__ = ["postgres_server", "postgres_url"]
 ROUND_SECONDS = 150.0
 
 

@@ -12,9 +12,7 @@ from service.clock import utc_now
 from service.store.database import migrate, open_database
 from tests.crash.deployment import Deployment
 from tests.private_servers import PrivateRedis
-from tests.servers import postgres_server, postgres_url
 
-__all__ = ["postgres_server", "postgres_url"]
 Deploy = Callable[..., Deployment]
 SETTINGS = {  # the product's own values, where the crash tests have short ones
     "ASIM_JOB_LEASE_SECONDS": "15",

@@ -13,10 +13,10 @@ from service.settings import Settings
 from service.store.columns import Row
 from service.store.database import migrate
 from tests.command import command
-from tests.servers import postgres_database, postgres_server, postgres_url, redis_server, redis_space
+from tests.servers import postgres_database
 from tests.service.kit import MAX_BODY_BYTES, START, Served, serve
 
-__all__ = ["command", "postgres_server", "postgres_url", "redis_server", "redis_space"]
+__all__ = ["command"]
 Serve = Callable[..., Served]
 
 
@@ -24,14 +24,6 @@ Serve = Callable[..., Served]
 def _no_settings_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in os.environ if name.startswith("ASIM_") and not name.startswith("ASIM_TEST_")]:
         monkeypatch.delenv(name)
-
-
-@pytest.fixture(scope="session")
-def migrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An empty database of the newest schema; a copy of it is quicker than its migrations."""
-    path = tmp_path_factory.mktemp("migrated") / "asim.db"
-    migrate(f"sqlite:///{path}")
-    return path
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -1,5 +1,6 @@
 """asim doctor on an installation that is well, and on ten that are not: what it says is wrong, and what to do."""
 
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -25,11 +26,14 @@ Plant = Callable[[Served], None]
 
 
 @pytest.fixture
-def well(tmp_path: Path) -> Iterator[Served]:
+def well(tmp_path: Path, migrated: Path) -> Iterator[Served]:
     """A service with one of everything, whose queues were served just now."""
     clock = Clock()
     clock.now = datetime.now(UTC)
-    served = serve(Settings(data_folder=tmp_path / "data"), clock)
+    settings = Settings(data_folder=tmp_path / "data")
+    settings.make_data_folder()
+    shutil.copy(migrated, settings.data_folder / "asim.db")
+    served = serve(settings, clock)
     fill(served, "rooms", 0)
     holder(served, "read")
     with served.services.database.write() as session:

@@ -1,8 +1,10 @@
 """Rows in files and in another database are the rows that were there, and the service goes on with them."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,7 @@ from uuid import uuid4
 
 import pytest
 import zstandard
-from sqlalchemy import func, select
+from sqlalchemy import func, make_url, select
 
 from service.backup import MANIFEST, Manifest, TableFile, backup, read_manifest, restore
 from service.settings import Settings
@@ -23,7 +25,7 @@ from service.store.tables import EventEpochRow, EventRow, KeyRow, MembershipRow
 from tests.command import Command
 from tests.servers import postgres_database
 from tests.service.access_table import fill
-from tests.service.kit import Served, answers, room, serve
+from tests.service.kit import Clock, Served, answers, room, serve
 
 APART = {"event_epoch"}  # says by how much this server's transactions are behind
 
@@ -37,20 +39,42 @@ def rows_of(url: str) -> dict[str, list[tuple[Any, ...]]]:
         }
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def filled(request: pytest.FixtureRequest, tmp_path: Path, postgres_server: str) -> Iterator[Served]:
-    """A service on a database of its own, with one of everything, and things that JSON could spoil."""
+@dataclass(frozen=True)
+class Prepared:
+    """What a service has left: its data folder, its database where that is no file in the folder, its time."""
+
+    folder: Path
+    database: str | None
+    now: datetime
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def prepared(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, postgres_server: str
+) -> Iterator[Prepared]:
+    """One of everything, and things that JSON could spoil."""
     with ExitStack() as stack:
-        url = ""  # a file in the data folder
+        url = ""
         if request.param == "postgresql":
             url = stack.enter_context(postgres_database(postgres_server))
             migrate(url)
-        served = serve(Settings(data_folder=tmp_path / "source", database_url=url))
-        stack.callback(served.close)
-        things = fill(served, 'quotes " and \\ and é', 1)
-        batch = served.acquire(things.project, 2, strategy="random")
-        assert served.label(things.project, answers(batch), batch).status_code == 201
-        yield served
+        settings = Settings(data_folder=tmp_path_factory.mktemp("prepared") / "source", database_url=url)
+        with closing(serve(settings)) as served:
+            things = fill(served, 'quotes " and \\ and é', 1)
+            batch = served.acquire(things.project, 2, strategy="random")
+            assert served.label(things.project, answers(batch), batch).status_code == 201
+        yield Prepared(settings.data_folder, make_url(url).database if url else None, served.clock.now)
+
+
+@pytest.fixture
+def filled(prepared: Prepared, tmp_path: Path, postgres_server: str) -> Iterator[Served]:
+    """A service on a copy of it, with a database of its own."""
+    with ExitStack() as stack:
+        url = stack.enter_context(postgres_database(postgres_server, prepared.database)) if prepared.database else ""
+        shutil.copytree(prepared.folder, tmp_path / "source")
+        clock = Clock()
+        clock.now = prepared.now
+        yield stack.enter_context(closing(serve(Settings(data_folder=tmp_path / "source", database_url=url), clock)))
 
 
 def stores(folder: Path) -> list[Blobs]:

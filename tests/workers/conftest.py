@@ -89,7 +89,7 @@ def trained_folder(tmp_path_factory: pytest.TempPathFactory, labeled_folder: Pat
 
 
 @pytest.fixture
-def opened(tmp_path: Path) -> Iterator[OpenLoop]:
+def opened(tmp_path: Path, migrated: Path) -> Iterator[OpenLoop]:
     """Opens a loop on a copy of a folder, or on a new one; closes all of them at the end."""
     loops: list[Loop] = []
 
@@ -97,6 +97,9 @@ def opened(tmp_path: Path) -> Iterator[OpenLoop]:
         own = tmp_path / f"data-{len(loops)}"
         if folder is not None:
             shutil.copytree(folder, own)
+        else:
+            own.mkdir()
+            shutil.copy(migrated, own / "asim.db")
         loops.append(open_loop(own, **settings))
         return loops[-1]
 

@@ -16,13 +16,12 @@ from service.settings import Settings
 from service.store.tables import JobRow
 from tests.loop.processes import eventually
 from tests.private_servers import free_port
-from tests.servers import RedisSpace, redis_server, redis_space
+from tests.servers import RedisSpace
 from tests.workers.in_process import Loop
 from workers.app import served_queues
 from workers.dispatch import run_next
 from workers.stage import Stage
 
-__all__ = ["redis_server", "redis_space"]
 ALL = ("train", "score", "label", "default")
 
 

@@ -39,6 +39,13 @@ def queued(loop: Loop) -> list[tuple[Proposal, float | None]]:
         return [((row.trajectory_id, row.start, tuple(row.actions or ())), row.score) for row in rows]
 
 
+@pytest.fixture
+def few_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A job looks at 100 states of the 600, for tests that do not ask which."""
+    monkeypatch.setattr("workers.exploration.STATES", 100)
+
+
+@pytest.mark.usefixtures("few_states")
 def test_a_strategy_proposes_under_the_rounds_models(trained: Loop) -> None:
     with pytest.raises(NotReady):
         trained.client.acquire(trained.project.id, 5, mode="explore", wait=0)
@@ -81,6 +88,7 @@ def test_proposals_have_the_scores_of_the_strategy_on_the_rounds_networks(traine
     np.testing.assert_allclose([score or 0.0 for _, score in ranked], expected, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.usefixtures("few_states")
 def test_a_proposal_is_given_out_once_and_others_follow(opened: OpenLoop, trained_folder: Path) -> None:
     trained = opened(trained_folder, queue_length=30)
     first, second = trained.acquire(20, mode="explore"), trained.acquire(20, mode="explore")
@@ -95,6 +103,7 @@ def test_a_proposal_is_given_out_once_and_others_follow(opened: OpenLoop, traine
     assert len(third.items) == 20
 
 
+@pytest.mark.usefixtures("few_states")
 def test_the_labeling_worker_executes_what_is_proposed(trained: Loop) -> None:
     batch = trained.acquire(12, mode="explore")
     before = trained.project.counts.labeled
@@ -118,6 +127,7 @@ def test_where_no_model_can_propose_chance_does_and_says_so(trained: Loop) -> No
     assert not trained.jobs("propose_explorations")
 
 
+@pytest.mark.usefixtures("few_states")
 def test_until_a_subgoal_generator_is_trained_chance_explores(labeled: Loop) -> None:
     asked = labeled.client.start_round(labeled.project.id)
     while labeled.client.round(asked.id).status != "current":
@@ -127,6 +137,7 @@ def test_until_a_subgoal_generator_is_trained_chance_explores(labeled: Loop) -> 
     assert labeled.acquire(4, mode="explore").strategy == "confident_cycle"
 
 
+@pytest.mark.usefixtures("few_states")
 def test_another_strategys_networks_are_trained_before_it_proposes(trained: Loop) -> None:
     with pytest.raises(NotReady):
         trained.client.acquire(trained.project.id, 2, strategy="vanilla_cycle", mode="explore", wait=0)
@@ -135,6 +146,7 @@ def test_another_strategys_networks_are_trained_before_it_proposes(trained: Loop
     assert trained.acquire(2, "vanilla_cycle", mode="explore").strategy == "vanilla_cycle"
 
 
+@pytest.mark.usefixtures("few_states")
 def test_labels_of_the_pool_leave_proposals_and_pool_queues_apart(trained: Loop) -> None:
     with pytest.raises(NotReady):
         trained.client.acquire(trained.project.id, 1, mode="explore", wait=0)
@@ -145,6 +157,7 @@ def test_labels_of_the_pool_leave_proposals_and_pool_queues_apart(trained: Loop)
     assert queued(trained) == before
 
 
+@pytest.mark.usefixtures("few_states")
 def test_a_job_that_runs_twice_proposes_the_same(trained: Loop) -> None:
     with pytest.raises(NotReady):
         trained.client.acquire(trained.project.id, 1, mode="explore", wait=0)
@@ -162,6 +175,7 @@ def test_a_job_that_runs_twice_proposes_the_same(trained: Loop) -> None:
     assert queued(trained) == before
 
 
+@pytest.mark.usefixtures("few_states")
 def test_a_cancelled_job_is_asked_for_anew(trained: Loop) -> None:
     with pytest.raises(NotReady):
         trained.client.acquire(trained.project.id, 1, mode="explore", wait=0)
@@ -189,6 +203,9 @@ def test_what_was_given_out_is_not_proposed_again_and_in_the_end_there_is_nothin
     opened: OpenLoop, trained_folder: Path
 ) -> None:
     trained = opened(trained_folder)
+    with trained.worker.database.write() as session:  # a pool of few rooms: every job proposes again for all of them
+        first = session.query(MembershipRow.id).filter_by(split="pool").order_by(MembershipRow.id).limit(2)
+        session.query(MembershipRow).filter(MembershipRow.id.not_in(first)).update({"segments": 0})
     given: list[Proposal] = []
 
     def ask_for_all() -> None:
@@ -198,7 +215,7 @@ def test_what_was_given_out_is_not_proposed_again_and_in_the_end_there_is_nothin
     with pytest.raises(Conflict, match=r"all that confident_cycle finds to explore .* has been given out"):
         ask_for_all()
     rooms = {proposal[:2] for proposal in given}
-    assert len(given) == len(set(given)) == len(rooms) * 7
+    assert len(given) == len(set(given)) == len(rooms) * 7 > 200
     assert len(trained.jobs("propose_explorations")) == 7 + 1
 
 
