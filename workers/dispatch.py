@@ -101,7 +101,7 @@ def _run(job: RunningJob, payload: JobPayload) -> Result:
             from service.store.provenance import open_provenance
             from workers.collection import run_collection
 
-            return run_collection(job, payload.collection, open_provenance(job.worker.settings))
+            return run_collection(job, payload, open_provenance(job.worker.settings))
         case TrainRound():
             from workers.training import run_round
 
