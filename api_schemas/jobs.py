@@ -16,10 +16,15 @@ JobState = Literal["queued", "running", "done", "failed", "cancelled"]
 
 
 class Collect(Schema):
-    """Run a behavior in the project's simulator and add its trajectories."""
+    """Run a behavior in the project's simulator and add its trajectories.
+
+    collection: what this job does: of a shard, its share. shard: its number; None, as in older jobs, is a collection in
+    one piece.
+    """
 
     kind: Literal["collect"] = "collect"
     collection: CollectionCreate
+    shard: int | None = None
 
 
 class TrainRound(Schema):
@@ -134,3 +139,9 @@ class Job(Schema):
     started_at: Timestamp | None
     heartbeat_at: Timestamp | None
     finished_at: Timestamp | None
+
+
+class CollectionStarted(Job):
+    """The job of a collection, of one in shards the first shard's. `jobs` names those of all shards, this one first."""
+
+    jobs: list[UUID]

@@ -10,12 +10,13 @@ SCIENCE_QUEUES = "train,score,default"
 COLLECTOR_QUEUES = "label"
 
 
-def runner_processes(settings: Settings, runners: int) -> list[Supervised]:
-    """The science runners, who cannot reach simulator states, and the collector, who can. None with a broker."""
+def runner_processes(settings: Settings, runners: int, collectors: int = 1) -> list[Supervised]:
+    """The science runners, who cannot reach simulator states, and the collectors, who can. None with a broker."""
     if not settings.embedded:
         return []
     science = [_runner(f"runner {number}", settings, SCIENCE_QUEUES) for number in range(1, runners + 1)]
-    return [*science, _runner("collector", settings, COLLECTOR_QUEUES)]
+    names = ["collector", *(f"collector {number}" for number in range(2, collectors + 1))]
+    return [*science, *(_runner(name, settings, COLLECTOR_QUEUES) for name in names)]
 
 
 def runner_environment(settings: Settings, queues: str) -> dict[str, str]:

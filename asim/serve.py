@@ -26,13 +26,14 @@ class ServeRefused(AsimError):
     """The service cannot start like this; the text says why and what to do."""
 
 
-def serve(settings: Settings, host: str, port: int, runners: int, tell: Tell) -> None:
+def serve(settings: Settings, host: str, port: int, runners: int, tell: Tell, *, collectors: int = 1) -> None:
     """Serve until SIGINT or SIGTERM, then end all runners; SystemExit 0 after a signal.
 
     Args:
         port: 0 takes a free one. The URL is told, and written to `serve.json` in the data folder with this process' id.
-        runners: processes for training and scoring; one more, for collections, may reach simulator states.
+        runners: processes for training and scoring.
         tell: prints one line for a person.
+        collectors: processes for collections, which may reach simulator states.
 
     Raises:
         ServeRefused: the port is taken, the data folder is being served already, or the host is not loopback and there
@@ -50,7 +51,7 @@ def serve(settings: Settings, host: str, port: int, runners: int, tell: Tell) ->
             migrate(settings.resolved_database_url())
         (folder / "serve.json").unlink(missing_ok=True)  # of one that was killed
         url = _url(host, listener.getsockname()[1])
-        supervisor = Supervisor(runner_processes(settings, runners), tell)
+        supervisor = Supervisor(runner_processes(settings, runners, collectors), tell)
 
         def started() -> None:
             _write_whole(folder / "serve.json", json.dumps({"url": url, "pid": os.getpid()}))

@@ -7,7 +7,9 @@ from api_schemas.projects import Project
 from asim.client import Client
 from asim.errors import AsimError
 from asim.report import Report
-from workers.labeling import run_labeling
+from workers.answering_process import AnsweringProcess
+from workers.labeling import OpenAnswerer, run_labeling
+from workers.simulators.base import SimulatorError
 from workers.unanswerable import UnanswerableItem
 
 
@@ -21,7 +23,12 @@ def given(client: Client, project: Project, acquisition: str, token: int | None)
     return found.model_copy(update={"token": token})
 
 
-def answer(client: Client, batch: Acquisition, seed: int, report: Report) -> None:
+def in_own_process(url: str, key: str | None, seconds: float) -> OpenAnswerer:
+    """The simulator in a process of its own, where an item may take so many seconds."""
+    return lambda _, project: AnsweringProcess(url, key, seconds, project)
+
+
+def answer(client: Client, batch: Acquisition, seed: int, report: Report, open_answerer: OpenAnswerer) -> None:
     """Label the batch with the project's simulator, telling what became of it. Raises AsimError where it cannot."""
     generator = np.random.default_rng(seed)
     if batch.reason is not None:
@@ -29,8 +36,10 @@ def answer(client: Client, batch: Acquisition, seed: int, report: Report) -> Non
     what = "explore from {} states drawn by {}" if batch.mode == "explore" else "label {} segments ranked by {}"
     with report.step(what.format(len(batch.items), batch.strategy)) as advance:
         try:
-            accepted = run_labeling(client, batch, generator, lambda done, all_: advance(done / all_, ""))
-        except UnanswerableItem as error:
+            accepted = run_labeling(
+                client, batch, generator, lambda done, all_: advance(done / all_, ""), open_answerer=open_answerer
+            )
+        except (UnanswerableItem, SimulatorError) as error:
             raise AsimError(str(error)) from error
     report.tell(f"{accepted.created} labels accepted, {accepted.duplicates} known before")
     if accepted.round is not None:

@@ -47,7 +47,7 @@ class Settings(BaseSettings):
     job_lease_seconds: float = Field(default=15.0, gt=0)
     job_max_attempts: int = Field(default=3, ge=1)
     checkpoint_seconds: float = Field(default=10.0, gt=0, description="a stage of training is kept this often")
-    silence_seconds: float = Field(default=600.0, gt=0, description="a job that says nothing for this long is hung")
+    silence_seconds: float = Field(default=600.0, gt=0, description="a job that is silent for longer is hung and ended")
     canary_seconds: float = Field(default=60.0, gt=0, description="ready while a canary of each queue is this young")
     resend_seconds: float = Field(default=15.0, gt=0, description="a sent job that nobody claimed may be sent again")
     visibility_seconds: float = Field(default=900.0, gt=0, description="after it, Redis returns a lost message")

@@ -66,7 +66,7 @@ def run_job(job_id: str) -> None:
 @cache
 def worker() -> Worker:
     """This process's connections, opened at its first task."""
-    return open_worker(settings, utc_now, served_queues(sys.argv))
+    return open_worker(settings, utc_now, served_queues(sys.argv), expendable=True)
 
 
 @worker_process_init.connect  # type: ignore[untyped-decorator]  # celery has no types

@@ -28,6 +28,7 @@ from service.store.blobs import Blobs
 from service.store.database import open_database
 from service.store.tables import JobRow
 from workers.job import GaveWay, Heartbeat, RunningJob, Worker
+from workers.watchdog import Watchdog
 
 log = get_logger("worker")
 TRANSIENT = (
@@ -39,11 +40,15 @@ TRANSIENT = (
 Result = dict[str, object]
 
 
-def open_worker(settings: Settings, clock: Callable[[], datetime], queues: tuple[str, ...]) -> Worker:
-    """A worker of this process on the settings' stores."""
+def open_worker(
+    settings: Settings, clock: Callable[[], datetime], queues: tuple[str, ...], *, expendable: bool = False
+) -> Worker:
+    """A worker of this process on the settings' stores. expendable: the process does nothing else, and ends where its
+    job hangs."""
     owner = f"{socket.gethostname()}:{os.getpid()}:{uuid4().hex[:8]}"
     database = open_database(settings.resolved_database_url())
-    return Worker(settings, database, Blobs(settings.resolved_blobs_url()), clock, owner, queues)
+    blobs, watchdog = Blobs(settings.resolved_blobs_url()), Watchdog(armed=expendable)
+    return Worker(settings, database, blobs, clock, owner, queues, watchdog=watchdog)
 
 
 def run_next(worker: Worker) -> bool:
@@ -101,7 +106,7 @@ def _run(job: RunningJob, payload: JobPayload) -> Result:
             from service.store.provenance import open_provenance
             from workers.collection import run_collection
 
-            return run_collection(job, payload.collection, open_provenance(job.worker.settings))
+            return run_collection(job, payload, open_provenance(job.worker.settings))
         case TrainRound():
             from workers.training import run_round
 

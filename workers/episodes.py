@@ -1,9 +1,8 @@
-"""Episodes: what a behavior does in a simulator, and which of its transitions are worth a label by action."""
+"""Episodes: what a behavior does in a simulator, one after the other, decided by a generator's state."""
 
 import hashlib
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from workers.explanation import explain
 from workers.simulators.base import Behavior, Simulator
 
+DIGEST = 16  # bytes that stand for an episode: a checkpoint holds one for each
 REPEATS = 1000  # episodes in a row that were seen before: the simulator has nothing new to show
 
 
@@ -34,79 +34,98 @@ class Episode:
         """T."""
         return len(self.actions)
 
+    def told_actions(self) -> list[Any]:
+        """The actions as a label holds them: integers, or lists of floats."""
+        return [action if isinstance(action, int) else action.tolist() for action in self.actions]
+
     def explained(self, simulator: Simulator, start: int) -> list[int]:
-        """All actions that lead from the state at `start` to what was observed next."""
+        """All discrete actions that lead from the state at `start` to what was observed next."""
         state = {name: array[start] for name, array in self.states.items()}
         observed = {name: stream[start + 1] for name, stream in self.observations.items()}
         return explain(simulator, state, observed)[0]
 
 
-def new_episodes(
+@dataclass
+class Drawn:
+    """What was drawn so far. With the generator's state it decides all episodes to come.
+
+    seen: digests of its episodes' observations.
+    """
+
+    rng: np.random.Generator
+    seen: set[bytes] = field(default_factory=set)
+    trajectories: int = 0
+    transitions: int = 0
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much is to be drawn: one of the two."""
+
+    transitions: int | None = None
+    trajectories: int | None = None
+
+    def longest(self, drawn: Drawn) -> float:
+        """How many transitions the next episode may have; 0 where all is drawn."""
+        done, of = self._counted(drawn)
+        left = of - done
+        return left if self.trajectories is None or left == 0 else np.inf
+
+    def share(self, drawn: Drawn) -> float:
+        """Of it that is drawn, from 0 to 1."""
+        return (
+            drawn.transitions / self.transitions if self.transitions else drawn.trajectories / (self.trajectories or 1)
+        )
+
+    def told(self, drawn: Drawn) -> str:
+        """The same in words."""
+        return "{} of {} {}".format(
+            *self._counted(drawn), "trajectories" if self.transitions is None else "transitions"
+        )
+
+    def _counted(self, drawn: Drawn) -> tuple[int, int]:
+        """How much of how much."""
+        if self.transitions is None:
+            return drawn.trajectories, self.trajectories or 0
+        return drawn.transitions, self.transitions
+
+
+def new_episodes(simulator: Simulator, behavior: Behavior, transitions: int, seed: int) -> Iterator[Episode]:
+    """Episodes of `transitions` transitions in all, decided by the seed; none twice."""
+    return further_episodes(simulator, behavior, Extent(transitions), Drawn(np.random.default_rng(seed)))
+
+
+def further_episodes(
     simulator: Simulator,
     behavior: Behavior,
-    transitions: int,
-    seed: int,
+    extent: Extent,
+    drawn: Drawn,
     known: Callable[[Episode], bool] = lambda episode: False,
-    on_repeat: Callable[[int, int], None] = lambda left, repeats: None,
+    on_repeat: Callable[[int], None] = lambda repeats: None,
     on_step: Callable[[], None] = lambda: None,
 ) -> Iterator[Episode]:
-    """Episodes of `transitions` transitions in all, decided by the seed; none twice, and none that is `known`.
+    """Episodes up to an extent, going on behind what was drawn, which is kept up to date; none twice, and none that is
+    `known`. Where it is cut and goes on with an equal `drawn`, they are those of one run.
 
-    Ends early where the simulator has nothing new to show. on_repeat: told the transitions left and how many episodes
-    in a row were seen before. on_step: called after every step, as a robot's episode takes long. Both may raise to
-    stop.
+    Ends early where the simulator has nothing new to show. on_repeat: told how many episodes in a row were seen before.
+    on_step: called after every step, as a robot's episode takes long. Both may raise to stop.
     """
-    rng = np.random.default_rng(seed)
-    seen: set[bytes] = set()
-    left, repeats = transitions, 0
-    while left > 0 and repeats < REPEATS:
-        episode = _episode(simulator, behavior, rng, left, on_step)
+    repeats = 0
+    while (longest := extent.longest(drawn)) > 0 and repeats < REPEATS:
+        episode = _episode(simulator, behavior, drawn.rng, longest, on_step)
         digest = _digest(episode)
-        if digest in seen or known(episode):
+        if digest in drawn.seen or known(episode):
             repeats += 1
-            on_repeat(left, repeats)
+            on_repeat(repeats)
             continue
-        seen.add(digest)
-        left, repeats = left - episode.transitions, 0
+        repeats = 0
+        drawn.seen.add(digest)
+        drawn.trajectories, drawn.transitions = drawn.trajectories + 1, drawn.transitions + episode.transitions
         yield episode
 
 
-class Quota:
-    """How many effective transitions of each action are still to be labeled.
-
-    A transition is effective when its action alone explains it: what happens by itself, like a flickering tile, has
-    every idle action as an explanation. Nothing is counted where no labels are asked for, as of boxes none can be.
-    """
-
-    def __init__(self, simulator: Simulator, names: Sequence[str], per_action: int) -> None:
-        self._simulator, self._names, self.per_action = simulator, names, per_action
-        self.taken: Counter[str] = Counter()
-
-    @property
-    def met(self) -> bool:
-        """Every action has its share; never true where no labels were asked for."""
-        return self.per_action > 0 and not self.missing()
-
-    def missing(self) -> dict[str, int]:
-        """By action, how many transitions are still wanted."""
-        short = {name: self.per_action - self.taken[name] for name in self._names}
-        return {name: number for name, number in short.items() if number > 0}
-
-    def take(self, episode: Episode) -> list[int]:
-        """Starts of the transitions of this episode to label: effective ones of actions that are still wanted."""
-        if not self.per_action:
-            return []
-        starts = []
-        for start, action in enumerate(episode.actions):
-            name = self._names[action]
-            if self.taken[name] < self.per_action and episode.explained(self._simulator, start) == [action]:
-                self.taken[name] += 1
-                starts.append(start)
-        return starts
-
-
 def _episode(
-    simulator: Simulator, behavior: Behavior, rng: np.random.Generator, most: int, on_step: Callable[[], None]
+    simulator: Simulator, behavior: Behavior, rng: np.random.Generator, most: float, on_step: Callable[[], None]
 ) -> Episode:
     """The next episode, cut after `most` transitions so that a collection is as long as was asked for."""
     seed, generator = int(rng.integers(2**31)), dict(rng.bit_generator.state)
@@ -126,11 +145,11 @@ def _episode(
 
 
 def _digest(episode: Episode) -> bytes:
-    """Equal observations, equal digest."""
+    """Equal observations, equal digest of DIGEST bytes."""
     digest = hashlib.sha256()
     for name in sorted(episode.observations):
         digest.update(episode.observations[name].tobytes())
-    return digest.digest()
+    return digest.digest()[:DIGEST]
 
 
 def _stacked(steps: list[dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:

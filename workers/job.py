@@ -19,8 +19,10 @@ from service.settings import Settings
 from service.store.blobs import Blobs
 from service.store.database import Database
 from service.store.queries import jobs as queries
+from workers.watchdog import Watchdog
 
 log = get_logger("worker")
+GRACE = 5.0  # seconds from where a job counts as hung, which is told, to the end of its process
 
 
 class GaveWay(Exception):
@@ -38,6 +40,7 @@ class Worker:
     owner: str
     queues: tuple[str, ...]
     stopping: threading.Event = field(default_factory=threading.Event)
+    watchdog: Watchdog = field(default_factory=lambda: Watchdog(armed=False))
 
 
 class RunningJob:
@@ -71,8 +74,9 @@ class RunningJob:
     def go_on(self) -> None:
         """Say that the job is at work still, where there is no more to report; from any thread.
 
-        A job that neither reports nor says this for `silence_seconds` counts as hung: call it once for each blob, chunk
-        or slice, whatever one of them may take. Raises JobLost, and GaveWay when the process ends.
+        A job that neither reports nor says this for `silence_seconds` counts as hung, and its process is ended: call it
+        once for each blob, chunk or slice, whatever one of them may take. Raises JobLost, and GaveWay when the process
+        ends.
         """
         self._heard = time.monotonic()
         if self._lost.is_set():
@@ -97,13 +101,19 @@ class RunningJob:
         with self.worker.database.read() as session:
             return queries.higher_waiting(session, self.worker.queues, self.lease.priority, self.now())
 
+    def watch(self) -> None:
+        """From what was heard last, the job has `silence_seconds` to say something, else its process is ended."""
+        left = self._heard + self.worker.settings.silence_seconds - time.monotonic()
+        self.worker.watchdog.wait(max(0.0, left) + GRACE)
+
     def beat(self) -> None:
         """Renew the lease once, and say that this worker is there: a Celery child has nobody else to say it.
 
-        A job that hangs is not renewed: its lease ends, and the reaper gives it to another.
+        A job that hangs is not renewed: its lease ends, the reaper gives it to another, and its process ends.
         """
         if self._hangs():
             return
+        self.watch()
         worker, seconds = self.worker, self.worker.settings.job_lease_seconds
         try:
             with worker.database.write() as session:
@@ -134,6 +144,7 @@ class Heartbeat:
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def __enter__(self) -> Self:
+        self._job.watch()
         self._thread.start()
         return self
 
@@ -142,6 +153,7 @@ class Heartbeat:
     ) -> None:
         self._done.set()
         self._thread.join()
+        self._job.worker.watchdog.rest()
 
     def _run(self) -> None:
         while not self._done.wait(min(2.0, self._job.worker.settings.job_lease_seconds / 3)):

@@ -79,7 +79,7 @@ def main() -> None:
     settings, queues = Settings(), tuple(options.queues.split(","))
     if {"train", "score"} & set(queues):
         prepare_science(settings)
-    worker = open_worker(settings, utc_now, queues)
+    worker = open_worker(settings, utc_now, queues, expendable=True)
     _stop_on_signals(worker)
     if options.parent is not None:
         end_with(options.parent)

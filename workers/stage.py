@@ -13,9 +13,9 @@ from models.network import Network
 from models.segments import SegmentBatch
 from models.training import TrainingConfig, TrainingState, advance, begin
 from service import events, jobs
-from service.errors import CorruptBlob, MissingBlob, ServiceError
 from service.log import get_logger
 from service.store.tables import JobRow
+from workers.checkpoint import Checkpoint
 from workers.job import GaveWay, RunningJob
 
 log = get_logger("worker")
@@ -29,6 +29,7 @@ class Stage:
 
     def __init__(self, job: RunningJob, name: str, round_id: UUID | None) -> None:
         self._job, self._name, self._round = job, name, round_id
+        self._checkpoint = Checkpoint(job, name)
         self._stored = 0  # the step of the newest checkpoint
 
     def train(
@@ -58,9 +59,8 @@ class Stage:
         """The transaction that stores the stage's result; its checkpoint goes with it. Raises JobLost."""
         with self._job.transaction() as session:
             yield session
-            row = session.get_one(JobRow, self._job.lease.job_id)
-            left, row.checkpoint_sha256, row.checkpoint_stage = row.checkpoint_sha256, None, None
-        self._discard(left)
+            left = self._checkpoint.refer(session, None)
+        self._checkpoint.discard(left)
 
     def _look_up(self, state: TrainingState, loss: float, tell: Tell) -> None:
         """Tell how far it is; where the job is to stop here, what was done is kept."""
@@ -77,49 +77,39 @@ class Stage:
 
     def _resumed(self, network: Network, batch: SegmentBatch, config: TrainingConfig) -> TrainingState | None:
         """The state that an earlier attempt left, if it is whole and of this schedule, network and data."""
-        with self._job.worker.database.read() as session:
-            row = session.get_one(JobRow, self._job.lease.job_id)
-        if row.checkpoint_sha256 is None or row.checkpoint_stage != self._name:
+        data = self._checkpoint.load()
+        if data is None:
             return None
         try:
-            state = TrainingState.from_bytes(self._job.worker.blobs.get("checkpoints", row.checkpoint_sha256))
-        except (MissingBlob, CorruptBlob, ValueError) as error:  # a store that is away for now is another attempt's
-            log.warning("checkpoint_unusable", stage=self._name, error=str(error))
+            state = TrainingState.from_bytes(data)
+        except ValueError as error:
+            self._checkpoint.cannot_use(error)
             return None
         differs = _difference(state, network, batch, config)
         if differs is not None:  # an upgrade came between the attempts; loading it would fail each of them
             log.warning("checkpoint_of_another_training", stage=self._name, differs=differs)
             return None
-        self._tell_of_resuming(row, state.step)
+        self._tell_of_resuming(state.step)
         return state
 
-    def _tell_of_resuming(self, row: JobRow, step: int) -> None:
+    def _tell_of_resuming(self, step: int) -> None:
         round_id = None if self._round is None else str(self._round)
-        data: dict[str, object] = {"job": str(row.id), "round": round_id, "stage": self._name, "step": step}
+        data: dict[str, object] = {"round": round_id, "stage": self._name, "step": step}
         with self._job.transaction() as session:
-            events.record(session, row.project_id, "training.resumed", data, self._job.now())
+            row = session.get_one(JobRow, self._job.lease.job_id)
+            events.record(session, row.project_id, "training.resumed", {"job": str(row.id), **data}, self._job.now())
         log.info("training_resumed", stage=self._name, step=step)
 
     def _store(self, state: TrainingState) -> None:
         """Replace the checkpoint by one that is further; that is progress, so attempts count anew."""
         if state.step <= self._stored:
             return
-        sha256 = self._job.worker.blobs.put("checkpoints", _own(self._job.lease.job_id, state).to_bytes())
+        sha256 = self._checkpoint.write(_own(self._job.lease.job_id, state).to_bytes())
         with self._job.transaction() as session:
-            row = session.get_one(JobRow, self._job.lease.job_id)
-            replaced, row.checkpoint_sha256, row.checkpoint_stage = row.checkpoint_sha256, sha256, self._name
+            replaced = self._checkpoint.refer(session, sha256)
             jobs.made_progress(session, self._job.lease)
         self._stored = state.step
-        if replaced != sha256:
-            self._discard(replaced)
-
-    def _discard(self, sha256: str | None) -> None:
-        if sha256 is None:
-            return
-        try:
-            self._job.worker.blobs.delete("checkpoints", sha256)
-        except (ServiceError, OSError) as error:  # nothing refers to it any more: it only takes up room
-            log.warning("checkpoint_not_deleted", sha256=sha256, error=str(error))
+        self._checkpoint.discard(replaced)
 
 
 def _own(job_id: UUID, state: TrainingState) -> TrainingState:

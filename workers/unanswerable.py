@@ -35,3 +35,10 @@ class EndedEarly(UnanswerableItem):
             f"item {item.rank}, explored from {item.trajectory}:{item.start}: the episode ended after {executed} "
             f"transitions, a segment of this project needs {needed}"
         )
+
+
+class ProcessEnded(UnanswerableItem):
+    """An item hung or crashed the simulator, or was not tried after others that did."""
+
+    def __init__(self, item: AcquisitionItem, what: str) -> None:
+        super().__init__(f"segment {item.trajectory}:{item.start} {what}")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from api_schemas.collections import CollectionCreate
 from api_schemas.errors import Problem
-from api_schemas.jobs import Job
+from api_schemas.jobs import CollectionStarted
 from api_schemas.projects import Project, ProjectCreate, ProjectPatch
 from api_schemas.trajectories import SplitChoice, TrajectoriesAdded, Trajectory
 from asim.arrays import Arrays, pack, unpack
@@ -83,6 +83,6 @@ class ProjectCalls(Calls):
         states = unpack(self._bytes(path, project=project, start=start, length=length))
         return states, json.loads(str(states.pop("__metadata__")))
 
-    def collect(self, collection: CollectionCreate) -> Job:
-        """POST /collections: the job that runs the behavior."""
-        return self._post("/collections", collection, Job)
+    def collect(self, collection: CollectionCreate) -> CollectionStarted:
+        """POST /collections: the job that runs the behavior, and the ids of all of them where there are shards."""
+        return self._post("/collections", collection, CollectionStarted)

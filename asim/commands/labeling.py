@@ -69,13 +69,16 @@ def label(
     acquisition: Annotated[str | None, typer.Option(help="Answer this one, taken elsewhere; needs --token.")] = None,
     token: Annotated[int | None, typer.Option(help="Of --acquisition.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the draw among actions that explain a step alike.")] = 0,
+    item_seconds: Annotated[
+        float, typer.Option(min=0.1, help="That the simulator may take for one of them; then it is ended.")
+    ] = 300.0,
     wait: Wait = 600.0,
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:
     """Acquire segments, or explorations, and answer them with the project's simulator."""
     from asim.report import Report
-    from asim.simulator_labeling import answer, given
+    from asim.simulator_labeling import answer, given, in_own_process
 
     with connect(url, key) as client, Report() as report:
         found = client.find_project(project)
@@ -87,7 +90,7 @@ def label(
             batch = client.acquire(
                 found.id, count, mode=mode, strategy=strategy, purpose=purpose, labeler="asim label", wait=wait
             )
-        answer(client, batch, seed, report)
+        answer(client, batch, seed, report, in_own_process(url, key, item_seconds))
 
 
 def _why(batch: "Acquisition", project: "Project") -> str:

@@ -25,11 +25,12 @@ def serve(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free port.")] = 8000,
     runners: Annotated[int, typer.Option(min=1, help="Processes that train and score.")] = 1,
+    collectors: Annotated[int, typer.Option(min=1, help="Processes that run simulators for collections.")] = 1,
 ) -> None:
     """Serve the API and the dashboard, with the runners that do the jobs, until Ctrl-C."""
     from asim.serve import serve as serve_until_signal
 
-    serve_until_signal(settings_of(data), host, port, runners, tell=_tell)
+    serve_until_signal(settings_of(data), host, port, runners, tell=_tell, collectors=collectors)
 
 
 def worker(

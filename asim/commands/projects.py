@@ -10,6 +10,7 @@ from asim.commands.console import DEFAULT_URL, Key, ProjectName, Split, Strategy
 from asim.errors import AsimError
 
 if TYPE_CHECKING:
+    from api_schemas.collections import CollectionLabels
     from api_schemas.environments import Environment
 
 UPLOAD_FILES, UPLOAD_BYTES = 200, 32 * 2**20  # of one request, so that no upload meets the service's limit
@@ -102,7 +103,8 @@ def change(
 def collect(
     project: ProjectName,
     *,
-    transitions: Annotated[int, typer.Option(min=1, help="Transitions to collect.")],
+    transitions: Annotated[int | None, typer.Option(min=1, help="Transitions to collect.")] = None,
+    trajectories: Annotated[int | None, typer.Option(min=1, help="Or whole trajectories.")] = None,
     behavior: Annotated[str | None, typer.Option(help="random, expert, ...; default the simulator's own.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of layouts and actions.")] = 0,
     split: Split = "auto",
@@ -110,26 +112,31 @@ def collect(
         int | None,
         typer.Option(min=1, help="Record labels of so many effective transitions of each action (discrete ones)."),
     ] = None,
+    labels: Annotated[
+        str | None, typer.Option(metavar="all|NUMBER", help="Record labels of all, or so many, segments (boxes).")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Share it among so many jobs, for as many collectors.")] = 1,
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:
     """Run a behavior in the project's simulator and add its trajectories; wait until they are there."""
-    from api_schemas.collections import CollectionCreate, CollectionLabels
+    from api_schemas.collections import CollectionCreate
+    from asim.collecting import await_collection
     from asim.report import Report
 
-    labels = None if labels_per_action is None else CollectionLabels(per_action=labels_per_action)
     with connect(url, key) as client, Report() as report, report.step(f"collect into {project}") as advance:
         collection = CollectionCreate(
             project=client.find_project(project).id,
             behavior=behavior,
             transitions=transitions,
+            trajectories=trajectories,
             seed=seed,
             split=split,
-            labels=labels,
+            labels=_labels(labels_per_action, labels),
+            shards=jobs,
         )
-        job = client.collect(collection)
-        done = client.wait_for_job(job.id, progress=lambda seen: advance(seen.progress, seen.message))
-    typer.echo(json.dumps(done.result))
+        done = await_collection(client, client.collect(collection), advance)
+    typer.echo(json.dumps(done))
 
 
 def import_files(
@@ -158,6 +165,17 @@ def import_files(
         for sent, accepted in add_labeled(client, found.id, labeled, split):
             told = f"{accepted.created} labels, {accepted.duplicates} known before"
             typer.echo(f"{sent} labeled trajectories or parts of them: {told}")
+
+
+def _labels(per_action: int | None, segments: str | None) -> "CollectionLabels | None":
+    from api_schemas.collections import CollectionLabels
+
+    if per_action is None and segments is None:
+        return None
+    if segments not in (None, "all") and not segments.isdecimal():
+        raise AsimError(f"--labels {segments}: must be all, or a number of segments")
+    number = None if segments in (None, "all") else int(segments)
+    return CollectionLabels(per_action=per_action, segments=number, all=segments == "all")
 
 
 def _environment(simulator: str | None, options: list[str], spaces: Path | None) -> "Environment":

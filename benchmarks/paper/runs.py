@@ -25,6 +25,7 @@ DATA = (
     "workers/simulators",
     "workers/episodes.py",
     "workers/explanation.py",
+    "workers/quotas.py",
     "service/store/codec.py",
     "benchmarks/paper/minigrid/composition.py",
     "benchmarks/paper/minigrid/datasets.py",

@@ -7,9 +7,9 @@ from fastapi import APIRouter, File, Query, Response, UploadFile
 
 from api_schemas.base import Page
 from api_schemas.collections import CollectionCreate
-from api_schemas.jobs import Job
+from api_schemas.jobs import CollectionStarted
 from api_schemas.trajectories import SplitChoice, TrajectoriesAdded, Trajectory
-from service import collections, jobs, pool, projects, streams
+from service import collections, pool, projects, streams
 from service.api.access import by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
 from service.api.description import refuses
@@ -125,10 +125,12 @@ def trajectory_provenance(
     responses=refuses(NoSimulator, UnknownBehavior),
     dependencies=[requires("admin", by_body)],
 )
-def collect(request: CollectionCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Job:
-    row = collections.request(session, request, now, held.settings.job_max_attempts)
-    response.headers.update({"Location": f"/jobs/{row.id}", "Retry-After": "1"})
-    return jobs.describe(row)
+def collect(
+    request: CollectionCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response
+) -> CollectionStarted:
+    rows = collections.request(session, request, now, held.settings.job_max_attempts)
+    response.headers.update({"Location": f"/jobs/{rows[0].id}", "Retry-After": "1"})
+    return collections.started(rows)
 
 
 def _stop(transitions: int, start: int, length: int | None) -> int:

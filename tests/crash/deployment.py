@@ -70,7 +70,7 @@ class Deployed:
 
     def children(self) -> list[int]:
         """Processes that it has started and that live."""
-        return [pid for pid in _pids() if _parent_of(pid) == self.pid and command_of(pid)]
+        return children_of(self.pid)
 
     def said(self) -> str:
         """Its log."""
@@ -241,6 +241,11 @@ def kill(pid: int, number: signal.Signals) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def children_of(parent: int) -> list[int]:
+    """Processes that it has started and that live."""
+    return [pid for pid in _pids() if _parent_of(pid) == parent and command_of(pid)]
 
 
 def _pids() -> list[int]:

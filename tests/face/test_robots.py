@@ -64,3 +64,37 @@ def test_labels_cannot_be_asked_for_by_action_in_a_sentence(asim: Command) -> No
         "labels.per_action: needs discrete actions to count by, and this project's are boxes of shape [7], got 2"
         in said
     )
+
+
+def test_a_collection_in_shards_is_waited_for_and_summed_up(asim: Command, url: str) -> None:
+    asim("project", "create", "shards", "--simulator", "minigrid", "--option", "max_steps=5")
+    told = asim("collect", "shards", "--trajectories", "5", "--jobs", "2", "--split", "pool", "--seed", "3")
+    assert json.loads(told.splitlines()[-1]) == {
+        "trajectories": 5,
+        "transitions": 25,
+        "labels": {},
+        "short_of": {},
+        "known_before": 0,
+    }
+    with Client(url) as client:
+        project = client.find_project("shards")
+        assert (project.counts.pool_trajectories, project.counts.pool_segments) == (5, 25)
+        assert [job.kind for job in client.jobs(project.id)] == ["collect", "collect"]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ([], "give transitions or trajectories, and one of them only; got neither"),
+        (["--trajectories", "2", "--labels", "some"], "--labels some: must be all, or a number of segments"),
+        (["--trajectories", "2", "--labels", "all"], "labels.all: is for boxes"),
+        (["--trajectories", "2", "--jobs", "3"], "shards: 3 of them cannot share 2 trajectories"),
+    ],
+)
+def test_a_collection_that_cannot_be_is_refused_in_a_sentence(
+    asim: Command, url: str, options: list[str], sentence: str
+) -> None:
+    with Client(url) as client:
+        if not any(project.name == "refused" for project in client.projects()):
+            asim("project", "create", "refused", "--simulator", "minigrid")
+    assert sentence in asim("collect", "refused", *options, status=1)

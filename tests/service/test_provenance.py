@@ -1,9 +1,13 @@
 """Simulator states: collected beside the trajectories, kept apart from them, served to labelers only."""
 
 import json
+from typing import Any
+from uuid import UUID
 
 import numpy as np
+import pytest
 
+from service.store.tables import JobRow
 from tests.service.conftest import Serve
 from tests.service.kit import UNKNOWN, Json, Served, refused, room, unpack
 
@@ -41,7 +45,8 @@ def test_states_are_in_no_blob_that_training_can_open(served: Served) -> None:
     collected(served)
     folder = served.settings.data_folder
     assert any(path.is_file() for path in (folder / "provenance").rglob("*"))
-    assert {path.name for path in (folder / "blobs").iterdir()} == {"trajectories"}
+    stored = [path.relative_to(folder / "blobs") for path in (folder / "blobs").rglob("*/*/*") if path.is_file()]
+    assert {path.parts[0] for path in stored} == {"trajectories"}
 
 
 def test_a_process_without_the_store_has_no_states_to_serve(start: Serve) -> None:
@@ -79,4 +84,41 @@ def test_a_collection_that_cannot_run_is_refused(served: Served) -> None:
     refused(answer, 422, "unknown-behavior", "psychic", "expert")
     answer = served.client.post("/collections", json=asked | {"labels": {"per_action": 2}})
     refused(answer, 422, "invalid-field", "labels.per_action", 2)
+    for labels, name in (({"all": True}, "labels.all"), ({"segments": 3}, "labels.segments")):
+        refused(served.client.post("/collections", json=asked | {"labels": labels}), 422, "invalid-field", name)
     assert served.get("/jobs", project=project)["items"] == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({}, "transitions: give transitions or trajectories, and one of them only; got neither"),
+        ({"transitions": 5, "trajectories": 6}, "got 5 and 6"),
+        ({"trajectories": 0}, "greater than or equal to 1"),
+        ({"trajectories": 3, "shards": 4}, "shards: 4 of them cannot share 3 trajectories"),
+        ({"transitions": 9, "shards": 4, "labels": {"per_action": 2}}, "shards: 4 of them cannot share 2 labels"),
+        ({"transitions": 9, "shards": 65}, "less than or equal to 64"),
+        ({"transitions": 9, "labels": {}}, "labels: give per_action, segments or all, and one of them only"),
+        ({"transitions": 9, "labels": {"all": True, "segments": 2}}, "and one of them only"),
+    ],
+)
+def test_a_collection_of_two_minds_is_refused_in_a_sentence(
+    served: Served, fields: dict[str, object], sentence: str
+) -> None:
+    answer = served.client.post("/collections", json={"project": served.project(), **fields})
+    assert answer.status_code == 422
+    assert sentence in answer.text
+
+
+def test_shards_are_jobs_with_shares_that_make_up_the_whole(served: Served) -> None:
+    project = served.project()
+    asked = {"project": project, "trajectories": 8, "shards": 3, "labels": {"per_action": 4}}
+    answer = served.client.post("/collections", json=asked).json()
+    assert len(set(answer["jobs"])) == 3
+    assert answer["id"] == answer["jobs"][0]
+    with served.services.database.read() as session:
+        payloads = [session.get_one(JobRow, UUID(job)).payload for job in answer["jobs"]]
+    collections: list[Any] = [payload["collection"] for payload in payloads]
+    assert [each["trajectories"] for each in collections] == [3, 3, 2]
+    assert [each["labels"]["per_action"] for each in collections] == [2, 1, 1]
+    assert [payload["shard"] for payload in payloads] == [0, 1, 2]

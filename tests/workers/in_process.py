@@ -107,10 +107,10 @@ class Loop:
         """All jobs of a kind, oldest first."""
         return [job for job in self.client.jobs(self.project.id) if job.kind == kind][::-1]
 
-    def collect(self, transitions: int, *, per_action: int = 0, **more: Any) -> Job:
+    def collect(self, transitions: int | None = None, *, per_action: int = 0, **more: Any) -> Job:
         """Collect and wait; the job as it ended."""
         labels = CollectionLabels(per_action=per_action) if per_action else None
-        asked = CollectionCreate(project=self.project.id, transitions=transitions, labels=labels, **more)
+        asked = CollectionCreate(project=self.project.id, transitions=transitions, **{"labels": labels, **more})
         job = self.client.collect(asked)
         self.drain()
         return self.client.job(job.id)

@@ -16,7 +16,7 @@ from asim.client import Client
 from asim.errors import Conflict
 from tests.workers.conftest import ROOM, OpenLoop, new_project
 from tests.workers.in_process import Loop, segments_of
-from workers import delivery, labeling
+from workers import answering, delivery
 from workers.explanation import explain
 from workers.labeling import run_labeling
 from workers.simulators.base import Simulator
@@ -278,7 +278,7 @@ def _measure(monkeypatch: pytest.MonkeyPatch, loop: Loop, sizes: list[int]) -> N
 
 def _end_episodes(monkeypatch: pytest.MonkeyPatch, batch: Acquisition, rank: int, after: int) -> None:
     """The episode that this item explores in is over after so many steps."""
-    explore = labeling._explore
+    explore = answering._explore
 
     def cut(
         client: Client, project: Any, simulator: Simulator, explainer: Any, item: AcquisitionItem, told: Any
@@ -287,7 +287,7 @@ def _end_episodes(monkeypatch: pytest.MonkeyPatch, batch: Acquisition, rank: int
             simulator = Cut(simulator, after)
         return explore(client, project, simulator, explainer, item, told)
 
-    monkeypatch.setattr(labeling, "_explore", cut)
+    monkeypatch.setattr(answering, "_explore", cut)
 
 
 class Cut:

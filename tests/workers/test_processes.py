@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from uuid import UUID
 
+import pytest
+
 from api_schemas.collections import CollectionCreate
 from api_schemas.jobs import Job
 from tests.loop.processes import eventually
@@ -18,17 +20,35 @@ SECONDS = 30.0
 HARD = 2_000_000  # transitions: more than there is time for
 
 
+HANGING = """
+import ctypes, sys
+from workers.runner import main
+from workers.simulators.minigrid import MiniGridSimulator
+hang, step, steps = ctypes.{library}(None).sleep, MiniGridSimulator.step, []
+def hanging(simulator, action):
+    steps.append(action)
+    return hang(1000) if len(steps) > 300 else step(simulator, action)
+MiniGridSimulator.step = hanging
+sys.argv = ["runner", "--queues", "label"]
+main()
+"""
+
+
 @contextmanager
-def collector(loop: Loop, lease: str = "1") -> Iterator["subprocess.Popen[bytes]"]:
+def collector(
+    loop: Loop, lease: str = "1", program: list[str] | None = None, **settings: str
+) -> Iterator["subprocess.Popen[bytes]"]:
     """The embedded runner for collections, killed at the end."""
-    argv = [sys.executable, "-m", "workers.runner", "--queues", "label"]
-    environment = {**os.environ, "ASIM_DATA_FOLDER": str(loop.folder), "ASIM_JOB_LEASE_SECONDS": lease}
-    process = subprocess.Popen(argv, env=environment, stderr=subprocess.DEVNULL)
+    argv = [sys.executable, *(program or ["-m", "workers.runner", "--queues", "label"])]
+    environment = {**os.environ, "ASIM_DATA_FOLDER": str(loop.folder), "ASIM_JOB_LEASE_SECONDS": lease, **settings}
+    process = subprocess.Popen(argv, env=environment, stderr=subprocess.PIPE if program else subprocess.DEVNULL)
     try:
         yield process
     finally:
         process.kill()
         process.wait(SECONDS)
+        if process.stderr is not None:
+            process.stderr.close()
 
 
 def collect(loop: Loop, transitions: int) -> UUID:
@@ -57,6 +77,22 @@ def test_a_job_that_kills_its_worker_every_time_fails_and_the_queue_moves_on(emp
     ended = job(empty, hard)
     assert ended.attempts == ended.max_attempts == 3
     assert "fell silent in attempt 3 of 3" in str(ended.error)
+
+
+@pytest.mark.parametrize("library", ["PyDLL", "CDLL"], ids=["no thread runs any more", "other threads run"])
+def test_a_hung_simulator_has_its_process_ended_and_another_goes_on(empty: Loop, library: str) -> None:
+    """A call of PyDLL keeps Python's lock while it runs, as a simulator in an endless loop of C may."""
+    hanging = ["-c", HANGING.format(library=library)]
+    asked = collect(empty, 600)
+    with collector(empty, "3", hanging, ASIM_SILENCE_SECONDS="3") as process:
+        eventually(lambda: job(empty, asked).state == "running", SECONDS, "the job does not start")
+        assert process.wait(SECONDS) == 1
+        assert process.stderr is not None
+        said = process.stderr.read().decode()
+    assert "in hanging" in said
+    with collector(empty):
+        eventually(lambda: job(empty, asked).state == "done", SECONDS, lambda: f"nobody goes on: {job(empty, asked)}")
+    assert empty.project.counts.pool_segments == 600
 
 
 def test_a_cancelled_jobs_worker_stops_and_takes_the_next(empty: Loop) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from api_schemas.collections import CollectionCreate
+from api_schemas.collections import CollectionCreate, CollectionLabels
 from api_schemas.environments import Environment
 from asim.errors import Invalid
 from service.reaper import reap
@@ -152,8 +152,9 @@ def test_a_hung_simulator_loses_its_job_to_a_worker_that_goes_on(
     loop.drain()
     released.set()
     first.join(60)
-    done = loop.client.job(asked.id)
-    assert (done.state, done.attempts) == ("done", 2)
+    assert loop.client.job(asked.id).state == "done"
+    started = [event for event in loop.client.events(loop.project.id) if event.kind == "job.started"]
+    assert [event.data["attempt"] for event in started] == [1, 2]
     assert loop.project.counts.pool_segments == 12
 
 
@@ -170,3 +171,35 @@ def test_a_long_episode_says_at_every_step_that_it_is_at_work(
     monkeypatch.setattr(RunningJob, "go_on", counted)
     loop.collect(50, behavior="random")
     assert len(told) > 50
+
+
+@pytest.mark.parametrize("split", ["pool", "held_out"])
+@pytest.mark.parametrize(("labels", "count"), [({"all": True}, 6), ({"segments": 4}, 4)])
+def test_whole_segments_are_labeled_with_the_actions_that_were_taken(
+    opened: OpenLoop, monkeypatch: pytest.MonkeyPatch, split: str, labels: dict[str, object], count: int
+) -> None:
+    loop = project_of(opened, "maniskill", cameras=False)
+    loop.name = "chunks"
+    new_project(loop, environment=loop.client.find_project("rooms").environment, segment_length=2)
+    taken, step = dict[bytes, list[float]](), ManiSkillSimulator.step
+
+    def recorded(simulator: ManiSkillSimulator, action: Action) -> Step:
+        reached = step(simulator, action)
+        taken[reached.observation["proprioception"].tobytes()] = np.asarray(action).tolist()
+        return reached
+
+    monkeypatch.setattr(ManiSkillSimulator, "step", recorded)
+    job = loop.collect(trajectories=2, split=split, labels=CollectionLabels.model_validate(labels))
+    assert (job.state, job.error) == ("done", None)
+    assert (job.result["labels"], job.result["short_of"]) == ({"segments": count}, {})
+    found = list(loop.client.labels(loop.project.id))
+    assert len(found) == count
+    for label in found:
+        seen = loop.client.trajectory_content(loop.project.id, label.trajectory, label.start, 2)
+        assert label.actions == [taken[place.tobytes()] for place in seen["proprioception"][1:]]
+        assert (label.split, label.source.kind, label.source.name) == (split, "simulator", "noisy_expert")
+    if split == "pool":  # the labeling worker finds the same actions: one label, not two that differ
+        again = loop.collect(trajectories=2, split=split, labels=CollectionLabels(all=True))
+        assert (again.state, again.error) == ("done", None)
+        assert again.result["known_before"] == 2
+        assert len(list(loop.client.labels(loop.project.id))) == 6

@@ -126,6 +126,18 @@ class Behavior(Protocol):
         """The next action. It may read the simulator's state and must leave the simulator unchanged."""
 
 
+@runtime_checkable
+class RememberingBehavior(Behavior, Protocol):
+    """A behavior that remembers more than its episode."""
+
+    @property
+    def memory(self) -> list[int]:
+        """All that decides, with simulator and generator, what it does in the episodes to come."""
+
+    def recall(self, memory: list[int]) -> None:
+        """Goes on as the behavior that had this memory."""
+
+
 def check_state(state: State, expected: Mapping[str, tuple[tuple[int, ...], str]]) -> None:
     """Raises StateError unless `state` has exactly the arrays of `expected`, a map from names to (shape, dtype)."""
     if state.keys() != expected.keys():

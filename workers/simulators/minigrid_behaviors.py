@@ -89,6 +89,15 @@ class BalancedBehavior:
         self.counts = np.zeros(ACTIONS, np.int64)
         self._aim: tuple[int, int] | None = None
 
+    @property
+    def memory(self) -> list[int]:
+        """The counts."""
+        return [int(count) for count in self.counts]
+
+    def recall(self, memory: list[int]) -> None:
+        """Goes on counting from there."""
+        self.counts = np.array(memory, np.int64)
+
     def reset(self, rng: np.random.Generator) -> None:
         """Forgets where it was going; the counts go on."""
         self._aim = None

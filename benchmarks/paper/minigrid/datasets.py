@@ -20,7 +20,8 @@ from benchmarks.paper.runs import DATA, sources_digest, write_at_once
 from models.segments import Segment, SegmentBatch
 from models.spaces import DiscreteAction, Spaces, StreamSpec
 from service.store import codec
-from workers.episodes import Episode, Quota, new_episodes
+from workers.episodes import Episode, new_episodes
+from workers.quotas import ActionQuota
 from workers.simulators.base import State
 from workers.simulators.catalog import make_behavior, make_simulator
 from workers.simulators.minigrid import ACTION_NAMES
@@ -141,7 +142,7 @@ def draw_test_labels(batch: SegmentBatch) -> SegmentBatch:
 def _made(spec: DataSpec) -> dict[str, NDArray[np.generic]]:
     simulator = make_simulator("minigrid", spec.options)
     behavior = make_behavior(spec.behavior, simulator)
-    quota = Quota(simulator, ACTION_NAMES, spec.per_action)
+    quota = ActionQuota(simulator, ACTION_NAMES, spec.per_action)
     parts: list[tuple[Episode, Sequence[int], NDArray[np.bool_]]] = []
     for episode in new_episodes(simulator, behavior, spec.transitions, spec.seed):
         starts = quota.take(episode) if spec.per_action else range(episode.transitions)
