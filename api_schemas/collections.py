@@ -22,7 +22,7 @@ class CollectionCreate(Schema):
     """Collect `transitions` transitions; with `labels`, stop as soon as every action has its share.
 
     behavior: one of the simulator's; null is its default, which covers good and bad: `mixture` of MiniGrid,
-    `noisy_expert` of the robots.
+    `noisy_expert` of the robots. `policy:` and the id of a policy rolls that out with noise.
 
     The behavior sees the simulator, so its actions are known while it runs: they are stored nowhere except as the
     labels that `labels` asks for.

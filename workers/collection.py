@@ -6,6 +6,7 @@ The actions are known only while the behavior runs. They are not stored, except 
 import json
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 
 from api_schemas.collections import CollectionCreate
 from api_schemas.environments import DEFAULT_BEHAVIORS, DiscreteActions
@@ -17,10 +18,11 @@ from service.store import codec
 from service.store.provenance import ProvenanceBlobs
 from service.store.queries import pool as pool_queries
 from service.store.tables import ProjectRow
+from workers.behaviors import behavior_named
 from workers.episodes import Episode, Quota, new_episodes
 from workers.job import RunningJob
-from workers.simulators.base import Simulator
-from workers.simulators.catalog import make_behavior, make_simulator
+from workers.simulators.base import Behavior, Simulator
+from workers.simulators.catalog import make_simulator
 
 BATCH = 25  # trajectories a transaction
 
@@ -45,7 +47,8 @@ def _collect(
 ) -> dict[str, object]:
     quota = _quota(project, asked, simulator)
     collected, done, batch = 0, 0, []
-    for episode in _new_episodes(job, project, asked, simulator):
+    behavior = behavior_named(_behavior(project, asked), simulator, partial(provenance.get, "policies"))
+    for episode in _new_episodes(job, project, asked, simulator, behavior):
         batch.append((episode, quota.take(episode)))
         collected, done = collected + 1, done + episode.transitions
         job.report(min(1.0, done / asked.transitions), f"collected {done} of {asked.transitions} transitions")
@@ -59,10 +62,9 @@ def _collect(
 
 
 def _new_episodes(
-    job: RunningJob, project: ProjectRow, asked: CollectionCreate, simulator: Simulator
+    job: RunningJob, project: ProjectRow, asked: CollectionCreate, simulator: Simulator, behavior: Behavior
 ) -> Iterator[Episode]:
     """Episodes that neither were drawn before nor are in the other split already."""
-    behavior = make_behavior(_behavior(project, asked), simulator)
 
     def known(episode: Episode) -> bool:
         return _in_other_split(job, project, asked, codec.content_id(episode.observations))

@@ -23,8 +23,9 @@ from workers.delivery import Answer, Delivery
 from workers.explainers import Explainer, explainer_of
 from workers.lease import Clock, Lease, lost
 from workers.recording import Arrays, Known, Provenance, Recording
+from workers.replay import Behaviors
 from workers.simulators.base import Observation, Simulator, SimulatorError, State
-from workers.simulators.catalog import make_simulator
+from workers.simulators.catalog import make_behavior, make_simulator
 from workers.unanswerable import EndedEarly, SimulatorFailed, UnanswerableItem, UnexplainedStep
 
 Progress = Callable[[int, int], None]
@@ -38,10 +39,12 @@ def run_labeling(
     generator: np.random.Generator,
     progress: Progress | None = None,
     clock: Clock = lambda: datetime.now(UTC),
+    behaviors: Behaviors = make_behavior,
 ) -> LabelsAccepted:
     """Label the items of an acquisition and post them under its token; a lease that runs short is extended.
 
     generator: where several actions explain a step, draws the one that the label names beside the whole set.
+    behaviors: of those that provenance tells of; by default the simulator's own, and labels of policies are searched.
     Where an item cannot be labeled, or its answer is refused, the others are posted all the same and it is given back
     before the error is raised. Raises UnanswerableItem and the client's errors, LeaseLost among them;
     where several items were refused, that of the first, which bears the others as notes.
@@ -55,7 +58,7 @@ def run_labeling(
     lease, answers = Lease(client, acquisition, clock), list[Answer]()
     refused: list[UnanswerableItem | ServiceError] = []
     with closing(make_simulator(environment.simulator, environment.options)) as simulator:
-        explainer = _explainer(client, project, simulator)
+        explainer = _explainer(client, project, simulator, behaviors)
         for done, item in enumerate(acquisition.items, 1):
             lease.keep()
             try:
@@ -86,7 +89,7 @@ def _first(refused: Sequence[Exception]) -> Exception:
     return refused[0]
 
 
-def _explainer(client: Client, project: Project, simulator: Simulator) -> Explainer:
+def _explainer(client: Client, project: Project, simulator: Simulator, behaviors: Behaviors) -> Explainer:
     def provenance(trajectory: str) -> Provenance:
         return Provenance(*client.provenance(project.id, trajectory))
 
@@ -95,7 +98,7 @@ def _explainer(client: Client, project: Project, simulator: Simulator) -> Explai
             with suppress(NotFound):  # of the states of recordings that came from elsewhere
                 yield Known(_recording(client, project, label.trajectory, label.start), label.actions)
 
-    return explainer_of(simulator, provenance, known)
+    return explainer_of(simulator, provenance, known, behaviors)
 
 
 def _recording(client: Client, project: Project, trajectory: str, start: int) -> Recording:

@@ -104,7 +104,7 @@ class Stage:
         """Replace the checkpoint by one that is further; that is progress, so attempts count anew."""
         if state.step <= self._stored:
             return
-        sha256 = self._job.worker.blobs.put("checkpoints", _own(self._job.lease.job_id, state).to_bytes())
+        sha256 = self._job.worker.blobs.put("checkpoints", own(self._job.lease.job_id, state).to_bytes())
         with self._job.transaction() as session:
             row = session.get_one(JobRow, self._job.lease.job_id)
             replaced, row.checkpoint_sha256, row.checkpoint_stage = row.checkpoint_sha256, sha256, self._name
@@ -122,7 +122,7 @@ class Stage:
             log.warning("checkpoint_not_deleted", sha256=sha256, error=str(error))
 
 
-def _own(job_id: UUID, state: TrainingState) -> TrainingState:
+def own(job_id: UUID, state: TrainingState) -> TrainingState:
     """The state under the job's name: equal states of two jobs are two blobs, and deleting one keeps the other."""
     name = torch.tensor(list(job_id.bytes), dtype=torch.uint8)
     return replace(state, tensors={**state.tensors, "job": name})

@@ -10,7 +10,7 @@ from api_schemas.collections import CollectionCreate
 from api_schemas.jobs import Job
 from api_schemas.trajectories import SplitChoice, TrajectoriesAdded, Trajectory
 from service import collections, jobs, pool, projects, streams
-from service.api.access import by_body, by_query, requires
+from service.api.access import CallerDep, by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
 from service.api.description import refuses
 from service.errors import (
@@ -125,8 +125,10 @@ def trajectory_provenance(
     responses=refuses(NoSimulator, UnknownBehavior),
     dependencies=[requires("admin", by_body)],
 )
-def collect(request: CollectionCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response) -> Job:
-    row = collections.request(session, request, now, held.settings.job_max_attempts)
+def collect(
+    request: CollectionCreate, session: WriteSession, held: ServicesDep, who: CallerDep, now: Now, response: Response
+) -> Job:
+    row = collections.request(session, request, now, held.settings.job_max_attempts, who.project)
     response.headers.update({"Location": f"/jobs/{row.id}", "Retry-After": "1"})
     return jobs.describe(row)
 
