@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 
 import numpy as np
-import torch
 
 from api_schemas.policies import PolicyCreate
 from models import checkpoints
@@ -55,16 +54,17 @@ def run_policy_training(job: RunningJob, asked: PolicyCreate, provenance: Proven
 def stage_steps(steps: int, stages: int) -> list[int]:
     """After how many steps each stage is: they grow by the same factor, from FIRST_SHARE of all steps to all."""
     shares = np.geomspace(FIRST_SHARE, 1.0, stages) if stages > 1 else np.ones(1)
-    return [round(steps * float(share)) for share in shares]
+    return [max(1, round(steps * float(share))) for share in shares]
 
 
-def new_policy(batch: SegmentBatch, generator: torch.Generator) -> DiffusionPolicy:
-    """For what the segments hold, normalised by them."""
+def begun(batch: SegmentBatch, seed: int) -> tuple[DiffusionPolicy, TrainingState]:
+    """A policy for what the segments hold, before its first step; the seed decides all that follows."""
     streams = {name: StreamSpec(tuple(s.shape[2:]), str(s.numpy().dtype)) for name, s in batch.observations.items()}
     actions = () if batch.actions is None else tuple(batch.actions.shape[3:])
+    generator = training_generator(seed, 0, DiffusionPolicy.kind)
     policy = DiffusionPolicy(Spaces(streams, BoxAction(-1.0, 1.0, actions)), DiffusionPolicyConfig(), generator)
     policy.fit_statistics(batch)
-    return policy
+    return policy, begin(policy, training_config(policy.spaces), generator)
 
 
 def states_at(
@@ -92,11 +92,9 @@ def _train(job: RunningJob, asked: PolicyCreate, provenance: ProvenanceBlobs, si
 
     episodes = demonstrate(simulator, asked.observations, asked.demonstrations, asked.seed, shown)
     batch = segments(episodes, DiffusionPolicyConfig().chunk)
-    generator = training_generator(asked.seed, 0, DiffusionPolicy.kind)
-    policy = new_policy(batch, generator)
-    config = training_config(policy.spaces)
-    state = _resumed(job, asked, provenance) or begin(policy, config, generator)
-    marks = stage_steps(config.steps, asked.stages)
+    policy, first = begun(batch, asked.seed)
+    state = _resumed(job, asked, provenance, first) or first
+    marks = stage_steps(state.config.steps, asked.stages)
 
     def tell(step: int, steps: int, loss: float) -> None:
         job.report(PREPARED + (1 - PREPARED) * step / steps, f"step {step} of {steps}, loss {loss:.3f}")
@@ -139,8 +137,10 @@ def _kept(job: RunningJob, asked: PolicyCreate) -> Sequence[PolicyRow]:
         return queries.of_training(session, asked.project, job.lease.job_id)
 
 
-def _resumed(job: RunningJob, asked: PolicyCreate, provenance: ProvenanceBlobs) -> TrainingState | None:
-    """The state at the last stage that an earlier attempt kept, if it is there and whole."""
+def _resumed(
+    job: RunningJob, asked: PolicyCreate, provenance: ProvenanceBlobs, first: TrainingState
+) -> TrainingState | None:
+    """The state at the last stage that an earlier attempt kept, if it is whole and of the same training as `first`."""
     kept = _kept(job, asked)
     if not kept or kept[-1].state_sha256 is None:
         return None
@@ -148,6 +148,9 @@ def _resumed(job: RunningJob, asked: PolicyCreate, provenance: ProvenanceBlobs) 
         state = TrainingState.from_bytes(provenance.get("trainings", kept[-1].state_sha256))
     except (MissingBlob, CorruptBlob, ValueError) as error:  # begun anew it comes to the same weights
         log.warning("training_unusable", stage=kept[-1].stage, error=str(error))
+        return None
+    if state.config != first.config:  # an upgrade came between the attempts
+        log.warning("training_of_another_schedule", found=str(state.config), now=str(first.config))
         return None
     log.info("training_resumed", stage=kept[-1].stage, step=state.step)
     return state

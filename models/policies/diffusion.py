@@ -37,7 +37,7 @@ class DiffusionPolicyConfig:
     embedding: int = 32  # of the noise step
     noise_steps: int = 100
     acting_steps: int = 10
-    prediction: Literal["epsilon", "sample"] = "epsilon"
+    prediction: Literal["epsilon", "sample"] = "sample"
 
     def __post_init__(self) -> None:
         if self.chunk < 2 or self.chunk % 2:

@@ -1,5 +1,6 @@
 """Noise schedules of diffusion policies: those of diffusers' schedulers, which is imported where a policy is used."""
 
+from functools import cache
 from importlib import import_module
 from typing import Any
 
@@ -10,11 +11,13 @@ class DiffusersMissing(ImportError):
     """Diffusion policies need a package that is not installed; the message names the command that installs it."""
 
 
+@cache
 def training_scheduler(noise_steps: int, prediction: str) -> Any:
     """A DDPMScheduler (Ho et al. 2020), whose `add_noise` is used. Raises DiffusersMissing."""
     return _scheduler("ddpm", "DDPMScheduler", noise_steps, prediction)
 
 
+@cache
 def acting_scheduler(noise_steps: int, acting_steps: int, prediction: str) -> Any:
     """A DDIMScheduler (Song et al. 2021) with its `timesteps` set; it adds no noise. Raises DiffusersMissing."""
     scheduler = _scheduler("ddim", "DDIMScheduler", noise_steps, prediction)

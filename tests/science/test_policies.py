@@ -65,7 +65,8 @@ def error(policy: DiffusionPolicy, batch: SegmentBatch) -> float:
 def test_it_learns_what_is_demonstrated(spaces: Spaces) -> None:
     untrained = DiffusionPolicy(spaces, CONFIG, seeded(0))
     other = demonstrations(100, 2, spaces)
-    assert error(trained(spaces), other) < 0.15 < 0.4 < error(untrained, other)
+    assert error(untrained, other) > 0.4
+    assert error(trained(spaces), other) < 0.15
 
 
 def test_equal_generators_give_equal_chunks_within_the_box(policy: DiffusionPolicy) -> None:
@@ -150,4 +151,4 @@ def test_images_are_shifted_by_rows_and_the_same_over_time() -> None:
     found = {divmod(int(each[0, middle, middle, 0]), SIZE) for each in moved}
     assert len(found) > 1
     assert all(abs(place - middle) <= SHIFT for pair in found for place in pair)
-    assert set(shifted(images, seeded(1)).unique().tolist()) <= set(images.unique().tolist())
+    assert set(moved.flatten().tolist()) <= set(images.flatten().tolist())

@@ -14,7 +14,7 @@ from models.spaces import BoxAction, Spaces, StreamSpec
 from workers.policies import PolicyBehavior, look, policy_of, rolled_out
 from workers.simulators.base import Action, Observation, Simulator, SimulatorError, State, Step
 
-SPACES = Spaces({"place": StreamSpec((2,), "float32")}, BoxAction(-1.0, 1.0, (3,)))
+SPACES = Spaces({"place": StreamSpec((2,), "float32")}, BoxAction(-1.0, 1.0, (7,)))
 CONFIG = DiffusionPolicyConfig(chunk=4, executed=3, channels=8, features=16)
 
 
@@ -22,7 +22,7 @@ class Place:
     """A point that actions push; it tells where it is beside what it observes, and counts how often it was asked."""
 
     observation_space = gym.spaces.Dict({"nothing": gym.spaces.Box(0, 1, (1,), np.float32)})
-    action_space = gym.spaces.Box(-1, 1, (3,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (7,), np.float32)
 
     def __init__(self) -> None:
         self._x, self.asked = np.zeros(2), 0
@@ -111,7 +111,7 @@ def test_the_number_of_threads_does_not_change_an_action(weights: bytes) -> None
         torch.set_num_threads(threads)
         found.append(acted(PolicyBehavior(policy_of(weights)), Place(), 6, seed=4)[1])
     torch.set_num_threads(1)
-    assert np.array_equal(*found)
+    assert np.array_equal(found[0], found[1])
 
 
 def test_a_policy_of_images_sees_what_is_observed() -> None:
@@ -128,4 +128,5 @@ def test_bytes_that_are_no_policy_are_refused() -> None:
 
 def blind() -> Simulator:
     methods = {name: value for name, value in vars(Place).items() if name != "arrangement"}
-    return type("Blind", (), methods)()
+    made: Simulator = type("Blind", (), methods)()
+    return made

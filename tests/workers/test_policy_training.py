@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from api_schemas.environments import BoxActions, Environment, Spaces, Stream
+from api_schemas.environments import BoxActions, Environment, Stream
+from api_schemas.environments import Spaces as ProjectSpaces
 from api_schemas.jobs import Job
 from api_schemas.policies import Policy, PolicyCreate
 from api_schemas.projects import ProjectCreate
@@ -16,6 +17,8 @@ from asim.errors import Conflict, Invalid, NotFound
 from asim.simulator_labeling import behaviors_of
 from models import checkpoints
 from models.policies.diffusion import training_config
+from models.spaces import Spaces
+from models.training import TrainingConfig, advance
 from service.store.provenance import ProvenanceBlobs
 from tests.workers.conftest import OpenLoop
 from tests.workers.in_process import Loop
@@ -27,12 +30,15 @@ from workers.job import GaveWay
 from workers.labeling import run_labeling
 from workers.policy_training import stage_steps
 
-STAGES = 3
+STAGES, STEPS = 3, 100
 
 
 @pytest.fixture(autouse=True)
 def _short_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policy_training, "training_config", lambda spaces: replace(training_config(spaces), steps=30))
+    def short(spaces: Spaces) -> TrainingConfig:
+        return replace(training_config(spaces), steps=STEPS, batch_size=8)
+
+    monkeypatch.setattr(policy_training, "training_config", short)
     monkeypatch.setattr(policy_training, "TRIALS", 1)
 
 
@@ -65,7 +71,7 @@ def test_stages_are_kept_as_they_are_reached(loop: Loop) -> None:
     assert (job.state, job.error, job.queue) == ("done", None, "label")
     kept = policies(loop)
     assert [policy.id for policy in kept] == job.result["policies"]
-    assert [(policy.stage, policy.steps) for policy in kept] == list(enumerate(stage_steps(30, STAGES)))
+    assert [(policy.stage, policy.steps) for policy in kept] == list(enumerate(stage_steps(STEPS, STAGES)))
     for policy in kept:
         weights = loop.client.policy_weights(loop.project.id, policy.id)
         assert checkpoints.describe(weights)["kind"] == "policy"
@@ -89,9 +95,9 @@ def test_a_second_attempt_goes_on_from_the_last_stage_to_the_same_weights(
     kept = policies(loop)
     assert len(kept) == stopped_at + 1
     steps = list[int]()
-    monkeypatch.setattr(policy_training, "advance", counting(steps, policy_training.advance))
+    monkeypatch.setattr(policy_training, "advance", counting(steps, advance))
     loop.drain()
-    assert steps == stage_steps(30, STAGES)[stopped_at:-1]
+    assert steps == stage_steps(STEPS, STAGES)[stopped_at:-1]
     other = project_of(opened, "maniskill", cameras=False, horizon=50)
     assert trained(other).result == loop.client.job(job.id).result
 
@@ -203,7 +209,7 @@ def test_what_a_project_cannot_use_is_refused_by_field_and_value(loop: Loop) -> 
 def test_only_robots_have_policies(empty: Loop) -> None:
     with pytest.raises(Invalid, match="project: needs actions in a box, this one's are 7 discrete"):
         trained(empty)
-    arm = Spaces(observations={"arm": Stream(dtype="float32", shape=(3,))}, actions=BoxActions(shape=(2,)))
+    arm = ProjectSpaces(observations={"arm": Stream(dtype="float32", shape=(3,))}, actions=BoxActions(shape=(2,)))
     with pytest.raises(Conflict, match="names no simulator"):
         trained(named(empty, "own", Environment(spaces=arm)))
 
@@ -213,5 +219,5 @@ def test_a_policy_of_images_learns_from_pictures(opened: OpenLoop) -> None:
     job = trained(loop, observations="images", stages=1)
     assert (job.state, job.error) == ("done", None)
     (policy,) = policies(loop)
-    assert (policy.observations, policy.steps) == ("images", 30)
+    assert (policy.observations, policy.steps) == ("images", STEPS)
     assert loop.collect(3, behavior=f"policy:{policy.id}", split="pool").state == "done"
