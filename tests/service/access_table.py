@@ -7,15 +7,13 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from uuid import UUID, uuid4
+from uuid import UUID
 
 from fastapi.testclient import TestClient
 from httpx2 import Response
-from sqlalchemy.orm import Session
 
 from api_schemas.keys import Scope
-from api_schemas.policies import PolicyCreate
-from service import policies, registry, rounds
+from service import registry, rounds
 from service.registry import TrainedModel
 from service.settings import Settings
 from service.store.tables import ProjectRow
@@ -81,7 +79,6 @@ def fill(served: Served, name: str, seed: int) -> Things:
         asked = rounds.request(session, session.get_one(ProjectRow, UUID(project)), served.clock())
         trained = TrainedModel("world_model", 0, "grid", {"of": name}, sha256, len(weights), {})
         model = registry.register(session, UUID(project), asked.id, trained, 0, served.clock())
-        policy = _policy(served, session, UUID(project), weights)
     key = served.client.post("/keys", json={"name": name, "scopes": ["read"], "project": project}).json()
     ids = {
         "project_id": project,
@@ -89,19 +86,11 @@ def fill(served: Served, name: str, seed: int) -> Things:
         "acquisition_id": batch["id"],
         "round_id": str(asked.id),
         "model_id": str(model.id),
-        "policy_id": policy,
+        "policy_id": served.policy(project, weights),
         "job_id": str(asked.job_id),
         "key_id": key["id"],
     }
     return Things(project, ids)
-
-
-def _policy(served: Served, session: Session, project: UUID, weights: bytes) -> str:
-    store = served.services.provenance
-    assert store is not None
-    stage = policies.Stage(store.put("policies", weights), len(weights), None, 0, 10, 0.5, 2)
-    policies.keep(session, uuid4(), PolicyCreate(project=project), stage, served.clock())
-    return stage.sha256
 
 
 def ask(client: TestClient, endpoint: Endpoint, things: Things, headers: Mapping[str, str] | None = None) -> Response:

@@ -206,6 +206,14 @@ def test_what_a_project_cannot_use_is_refused_by_field_and_value(loop: Loop) -> 
     assert not list(poke.client.jobs(poke.project.id))
 
 
+def test_a_worker_that_cannot_reach_the_provenance_store_refuses(loop: Loop) -> None:
+    job = loop.client.train_policy(asked(loop))
+    loop.drain(loop.another_worker(loop.settings.model_copy(update={"provenance_url": ""})))
+    ended = loop.client.job(job.id)
+    assert (ended.state, policies(loop)) == ("failed", [])
+    assert "weights of policies are in the provenance store" in (ended.error or "")
+
+
 def test_only_robots_have_policies(empty: Loop) -> None:
     with pytest.raises(Invalid, match="project: needs actions in a box, this one's are 7 discrete"):
         trained(empty)
