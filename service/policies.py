@@ -1,5 +1,6 @@
 """Policies: their training as a job, the stages that it keeps, and which of them a project can roll out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from uuid import UUID
@@ -41,13 +42,14 @@ def request(session: Session, asked: PolicyCreate, now: datetime, max_attempts: 
 
 
 def keep(session: Session, training: UUID, asked: PolicyCreate, stage: Stage, now: datetime) -> str | None:
-    """A row for the stage, in place of one with the same weights; only the newest of a training has a state.
+    """A row for the stage, in place of one with the same weights; only one of a training has a state.
 
     training: the job. Returns the hash of the state that is now of no use, if there was one.
     """
-    left = None
-    for row in queries.of_training(session, asked.project, training)[-1:]:
-        left, row.state_sha256 = row.state_sha256, None
+    before = with_state(queries.of_training(session, asked.project, training))
+    left = None if before is None else before.state_sha256
+    if before is not None:
+        before.state_sha256 = None
     row = PolicyRow(
         project_id=asked.project,
         sha256=stage.sha256,
@@ -66,6 +68,11 @@ def keep(session: Session, training: UUID, asked: PolicyCreate, stage: Stage, no
     told: dict[str, object] = {"policy": stage.sha256, "stage": stage.number, "success": stage.success}
     events.record(session, asked.project, "policy.kept", told, now)
     return left
+
+
+def with_state(rows: Sequence[PolicyRow]) -> PolicyRow | None:
+    """The stage that training goes on from."""
+    return next((row for row in rows if row.state_sha256 is not None), None)
 
 
 def find(session: Session, project_id: UUID, sha256: str) -> PolicyRow:

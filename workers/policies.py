@@ -9,8 +9,16 @@ from numpy.typing import NDArray
 
 from models import checkpoints
 from models.policies.diffusion import HISTORY, DiffusionPolicy
+from models.policies.noise import DiffusersMissing, training_scheduler
 from models.segments import Observations
-from workers.simulators.base import ArrangedSimulator, Behavior, Observation, Simulator, SimulatorError
+from workers.simulators.base import (
+    ArrangedSimulator,
+    Behavior,
+    Observation,
+    Simulator,
+    SimulatorError,
+    SimulatorUnavailable,
+)
 from workers.simulators.robot_behaviors import NoisyBehavior
 
 Form = Literal["state", "images"]
@@ -23,8 +31,17 @@ def policy_of(weights: bytes) -> DiffusionPolicy:
     return cast(DiffusionPolicy, checkpoints.load(weights, expect_kind=DiffusionPolicy.kind))
 
 
+def check_installed() -> None:
+    """Raises SimulatorUnavailable, with the command to run, where policies lack a package."""
+    try:
+        training_scheduler(1, "sample")
+    except DiffusersMissing as error:
+        raise SimulatorUnavailable(str(error)) from error
+
+
 def rolled_out(weights: bytes) -> Behavior:
-    """What a collection does with a policy. Raises CheckpointError."""
+    """What a collection does with a policy. Raises CheckpointError, SimulatorUnavailable."""
+    check_installed()
     return NoisyBehavior(PolicyBehavior(policy_of(weights)), LOUDEST)
 
 

@@ -25,7 +25,7 @@ from service.store.queries import policies as queries
 from service.store.tables import PolicyRow
 from workers.demonstrations import FIRST_OTHER, demonstrate, segments
 from workers.job import RunningJob
-from workers.policies import PolicyBehavior, policy_of
+from workers.policies import PolicyBehavior, check_installed, policy_of
 from workers.rollouts import rollout
 from workers.simulators.base import Simulator
 from workers.simulators.catalog import make_simulator
@@ -40,7 +40,8 @@ PREPARED = 0.2  # of a training's time: the demonstrations
 def run_policy_training(job: RunningJob, asked: PolicyCreate, provenance: ProvenanceBlobs | None) -> dict[str, object]:
     """Train, from the last stage on that an earlier attempt kept; the weights are those of one uninterrupted run."""
     if provenance is None:
-        raise PoliciesOutOfReach("observations")
+        raise PoliciesOutOfReach(f"training in project {asked.project}")
+    check_installed()
     with job.worker.database.read() as session:
         environment = projects.environment_of(projects.find(session, asked.project))
     options = environment.options | {"cameras": asked.observations == "images"}  # poses are known without drawing
@@ -141,18 +142,18 @@ def _resumed(
     job: RunningJob, asked: PolicyCreate, provenance: ProvenanceBlobs, first: TrainingState
 ) -> TrainingState | None:
     """The state at the last stage that an earlier attempt kept, if it is whole and of the same training as `first`."""
-    kept = _kept(job, asked)
-    if not kept or kept[-1].state_sha256 is None:
+    kept = policies.with_state(_kept(job, asked))
+    if kept is None:
         return None
     try:
-        state = TrainingState.from_bytes(provenance.get("trainings", kept[-1].state_sha256))
+        state = TrainingState.from_bytes(provenance.get("trainings", str(kept.state_sha256)))
     except (MissingBlob, CorruptBlob, ValueError) as error:  # begun anew it comes to the same weights
-        log.warning("training_unusable", stage=kept[-1].stage, error=str(error))
+        log.warning("training_unusable", stage=kept.stage, error=str(error))
         return None
     if state.config != first.config:  # an upgrade came between the attempts
         log.warning("training_of_another_schedule", found=str(state.config), now=str(first.config))
         return None
-    log.info("training_resumed", stage=kept[-1].stage, step=state.step)
+    log.info("training_resumed", stage=kept.stage, step=state.step)
     return state
 
 

@@ -1,5 +1,6 @@
 """Policies at work, on a toy arm and by replay: what they see, and that the same states and chance give the same."""
 
+import sys
 from typing import Any
 
 import gymnasium as gym
@@ -10,9 +11,10 @@ from numpy.typing import NDArray
 
 from models import checkpoints
 from models.policies.diffusion import DiffusionPolicy, DiffusionPolicyConfig
+from models.policies.noise import training_scheduler
 from models.spaces import BoxAction, Spaces, StreamSpec
 from workers.policies import PolicyBehavior, look, policy_of, rolled_out
-from workers.simulators.base import Action, Observation, Simulator, SimulatorError, State, Step
+from workers.simulators.base import Action, Observation, Simulator, SimulatorError, SimulatorUnavailable, State, Step
 
 SPACES = Spaces({"place": StreamSpec((2,), "float32")}, BoxAction(-1.0, 1.0, (7,)))
 CONFIG = DiffusionPolicyConfig(chunk=4, executed=3, channels=8, features=16)
@@ -119,6 +121,17 @@ def test_a_policy_of_images_sees_what_is_observed() -> None:
     assert look(Place(), "state")["place"].tolist() == [0, 0]
     with pytest.raises(SimulatorError, match="A Blind does not tell where everything is"):
         look(blind(), "state")
+
+
+def test_a_missing_package_is_told_with_the_command_that_installs_it(
+    weights: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training_scheduler.cache_clear()
+    monkeypatch.setitem(sys.modules, "diffusers.schedulers.scheduling_ddpm", None)
+    with pytest.raises(
+        SimulatorUnavailable, match=r"Package 'diffusers' cannot be imported .* Run `make setup-robots`"
+    ):
+        rolled_out(weights)
 
 
 def test_bytes_that_are_no_policy_are_refused() -> None:
