@@ -90,8 +90,10 @@ def measure(task: Task, asked: argparse.Namespace) -> list[Figure]:
         Figure(f"{task.name}_demonstrations", shown.processor, "s of processor time"),
         Figure(f"{task.name}_training", last.processor, "s of processor time"),
         Figure(f"{task.name}_time", minutes, "min by the clock, demonstrations and training", MINUTES, "below"),
-        Figure(f"{task.name}_first_stage", first.success, f"of {asked.episodes} episodes solved"),
-        Figure(f"{task.name}_last_stage", last.success, f"of {asked.episodes} episodes solved", first.success + RISE),
+        Figure(f"{task.name}_first_stage", first.success, f"share of {asked.episodes} episodes solved"),
+        Figure(
+            f"{task.name}_last_stage", last.success, f"share of {asked.episodes} episodes solved", first.success + RISE
+        ),
         Figure(f"{task.name}_order", rising or 0.0, "Spearman's rho of stage and success", ORDER),
     ]
 
