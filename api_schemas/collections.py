@@ -40,7 +40,7 @@ class CollectionCreate(Schema):
     as there are so many.
 
     behavior: one of the simulator's; null is its default, which covers good and bad: `mixture` of MiniGrid,
-    `noisy_expert` of the robots.
+    `noisy_expert` of the robots. `policy:` and the id of a policy rolls that out with noise.
     shards: jobs that different workers run side by side, each with its share of transitions or trajectories and of
     labels, and a generator of its own that follows from the seed and its number.
 

@@ -207,6 +207,15 @@ SIMULATOR_SPACES: dict[str, Callable[[Mapping[str, object]], Spaces]] = {
     "minigrid": minigrid_spaces,
     "robosuite": robosuite_spaces,
 }
+ROBOTS: dict[str, type[RobosuiteOptions] | type[ManiSkillOptions]] = {
+    "maniskill": ManiSkillOptions,
+    "robosuite": RobosuiteOptions,
+}
+
+
+def takes_images(spaces: Spaces) -> bool:
+    """Whether an observation holds camera images."""
+    return any(stream.dtype == "uint8" and len(stream.shape) == 3 for stream in spaces.observations.values())
 
 
 class Environment(Schema):
@@ -240,3 +249,9 @@ class Environment(Schema):
         if self.simulator is None:  # the validator refuses this; the check is for the type
             raise ValueError("spaces: needed where no simulator is named")
         return SIMULATOR_SPACES[self.simulator](self.options)
+
+    def task(self) -> str | None:
+        """The robot task, also where it is the simulator's first one; None where there are no robots."""
+        if self.simulator not in ROBOTS:
+            return None
+        return ROBOTS[self.simulator].model_validate(dict(self.options)).task

@@ -7,6 +7,7 @@ from pydantic import Field
 
 from api_schemas.base import Schema, Timestamp
 from api_schemas.collections import CollectionCreate
+from api_schemas.policies import PolicyCreate
 from api_schemas.strategies import StrategyName
 
 RUN_JOB = "asim.run_job"  # the one Celery task; its argument is a job id
@@ -25,6 +26,13 @@ class Collect(Schema):
     kind: Literal["collect"] = "collect"
     collection: CollectionCreate
     shard: int | None = None
+
+
+class TrainPolicy(Schema):
+    """Train a policy on an expert's demonstrations and keep its stages; states and actions are at hand here only."""
+
+    kind: Literal["train_policy"] = "train_policy"
+    policy: PolicyCreate
 
 
 class TrainRound(Schema):
@@ -92,6 +100,7 @@ class Canary(Schema):
 
 JobPayload = Annotated[
     Collect
+    | TrainPolicy
     | TrainRound
     | TrainSubgoalGenerator
     | ScoreShard
@@ -104,6 +113,7 @@ JobPayload = Annotated[
 
 QUEUES: dict[str, Queue] = {  # a canary names its own
     "collect": "label",
+    "train_policy": "label",
     "train_round": "train",
     "train_subgoal_generator": "train",
     "score_shard": "score",

@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from asim.commands import keys, labeling, processes, projects, upkeep, work
+from asim.commands import keys, labeling, policies, processes, projects, upkeep, work
 from asim.commands.console import explain
 
 app = typer.Typer(
@@ -20,6 +20,7 @@ app.command("alive")(processes.alive)
 app.command("demo")(processes.demo)
 app.add_typer(projects.app, name="project", help="Create, list, show and change projects.")
 app.add_typer(keys.app, name="key", help="Make, list and revoke API keys, on the service's own database.")
+app.add_typer(policies.app, name="policy", help="Train policies of robot tasks, and list them.")
 app.command("collect")(projects.collect)
 app.command("import")(projects.import_files)
 app.command("acquire")(labeling.acquire)

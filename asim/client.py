@@ -4,12 +4,13 @@ import httpx
 
 from asim.calls.jobs import JobCalls
 from asim.calls.labels import LabelCalls
+from asim.calls.policies import PolicyCalls
 from asim.calls.projects import ProjectCalls
 from asim.calls.rounds import RoundCalls
 from asim.transport import Transport
 
 
-class Client(ProjectCalls, LabelCalls, RoundCalls, JobCalls):
+class Client(ProjectCalls, PolicyCalls, LabelCalls, RoundCalls, JobCalls):
     """Speaks to one service. Use it as a context manager, or call `close`.
 
     Args:

@@ -35,10 +35,12 @@ def answer(client: Client, batch: Acquisition, seed: int, report: Report, open_a
         report.tell(f"a smaller batch: {batch.reason}")
     what = "explore from {} states drawn by {}" if batch.mode == "explore" else "label {} segments ranked by {}"
     with report.step(what.format(len(batch.items), batch.strategy)) as advance:
+
+        def tell(done: int, count: int) -> None:
+            advance(done / count, "")
+
         try:
-            accepted = run_labeling(
-                client, batch, generator, lambda done, all_: advance(done / all_, ""), open_answerer=open_answerer
-            )
+            accepted = run_labeling(client, batch, generator, tell, open_answerer=open_answerer)
         except (UnanswerableItem, SimulatorError) as error:
             raise AsimError(str(error)) from error
     report.tell(f"{accepted.created} labels accepted, {accepted.duplicates} known before")

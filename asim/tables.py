@@ -12,6 +12,7 @@ from api_schemas.acquisitions import Acquisition
 from api_schemas.events import Event
 from api_schemas.jobs import Job
 from api_schemas.keys import Key
+from api_schemas.policies import Policy
 from api_schemas.projects import Project
 from api_schemas.rounds import ModelError, ModelErrorCurve, Round
 
@@ -56,6 +57,16 @@ def job_table(jobs: Sequence[Job]) -> Table:
     for job in jobs:
         attempts = f"{job.attempts} of {job.max_attempts}"
         table.add_row(str(job.id), job.kind, job.state, attempts, f"{job.progress:.0%}", job.message, job.error or "")
+    return table
+
+
+def policy_table(policies: Sequence[Policy]) -> Table:
+    """One row a policy."""
+    table = _table("stage", "id", "observations", "steps", "success", "episodes")
+    for policy in policies:
+        stage = f"{policy.stage + 1} of {policy.stages}"
+        numbers = [str(policy.steps), f"{policy.success:.0%}", str(policy.episodes)]
+        table.add_row(stage, policy.id, policy.observations, *numbers)
     return table
 
 

@@ -11,6 +11,7 @@ from safetensors.torch import save as save_tensors
 
 from models.families import family_named
 from models.network import Network
+from models.policies.diffusion import DiffusionPolicy, DiffusionPolicyConfig
 from models.spaces import Spaces
 
 FORMAT = 1
@@ -67,4 +68,6 @@ def _built(description: dict[str, Any]) -> Network:
     spaces = Spaces.from_json(description["spaces"])
     # The weights drawn here are overwritten by the checkpoint's.
     drawn = torch.Generator().manual_seed(0)
+    if description["kind"] == DiffusionPolicy.kind:  # policies belong to no family of models
+        return DiffusionPolicy(spaces, DiffusionPolicyConfig(**description["config"]), drawn)
     return family_named(description["family"]).build(description["kind"], spaces, description["config"], drawn)

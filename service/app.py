@@ -14,6 +14,7 @@ from service.api import (
     description,
     jobs,
     labels,
+    policies,
     problems,
     projects,
     rounds,
@@ -58,7 +59,8 @@ def create_app(settings: Settings | None = None, clock: Callable[[], datetime] =
     app.state.services = open_services(settings, clock)
     description.install(app)
     problems.install(app)
-    routers = [module.router for module in (projects, trajectories, acquisitions, labels, rounds, jobs, system)]
+    modules = (projects, trajectories, policies, acquisitions, labels, rounds, jobs, system)
+    routers = [module.router for module in modules]
     security.install(app, app.state.services, routers)
     for router in routers:
         app.include_router(router)

@@ -26,7 +26,8 @@ from service.store.provenance import ProvenanceBlobs
 from service.store.queries.references import PROVENANCE, Reference, references
 
 MANIFEST = "manifest.json"
-PASSING = "checkpoints"  # training replaces and deletes them all the time; one that is gone is a job that starts anew
+# Training replaces and deletes them all the time; one that is gone is a job that starts anew.
+PASSING = ("checkpoints", "trainings")
 
 
 class TableFile(Schema):
@@ -135,7 +136,7 @@ def _copy_blobs(
         try:
             target.put(kind, source.get(kind, sha256))
         except (CorruptBlob, MissingBlob):
-            missing += [] if kind == PASSING else [f"{kind}/{sha256}"]
+            missing += [] if kind in PASSING else [f"{kind}/{sha256}"]
         else:
             copied[kind] = copied.get(kind, 0) + 1
     return copied, missing

@@ -2,26 +2,35 @@
 
 from collections.abc import Sequence
 from datetime import datetime
+from uuid import UUID
 
 from sqlalchemy.orm import Session
 
 from api_schemas.collections import CollectionCreate, CollectionLabels
 from api_schemas.environments import DEFAULT_BEHAVIORS, SIMULATOR_BEHAVIORS, DiscreteActions
 from api_schemas.jobs import Collect, CollectionStarted
-from service import jobs, projects
+from api_schemas.policies import PREFIX
+from service import jobs, policies, projects
 from service.errors import InvalidField, NoSimulator, UnknownBehavior
 from service.store.tables import JobRow, ProjectRow
 
 
-def request(session: Session, asked: CollectionCreate, now: datetime, max_attempts: int = 3) -> list[JobRow]:
-    """The jobs that collect, one a shard. Raises UnknownResource, NoSimulator, UnknownBehavior, InvalidField."""
+def request(
+    session: Session, asked: CollectionCreate, now: datetime, max_attempts: int = 3, only: UUID | None = None
+) -> list[JobRow]:
+    """The jobs that collect, one a shard. Raises UnknownResource, NoSimulator, UnknownBehavior, InvalidField.
+
+    only: the one project that who asks may reach; None for all.
+    """
     project = projects.find(session, asked.project)
     simulator = projects.environment_of(project).simulator
     if simulator is None:
         raise NoSimulator(project.id)
     behaviors, behavior = SIMULATOR_BEHAVIORS[simulator], asked.behavior or DEFAULT_BEHAVIORS[simulator]
-    if behavior not in behaviors:
-        raise UnknownBehavior("behavior", behavior, f"must be one of {', '.join(behaviors)}")
+    if behavior.startswith(PREFIX):
+        policies.choose(session, project, behavior, only, now)
+    elif behavior not in behaviors:
+        raise UnknownBehavior("behavior", behavior, f"must be one of {', '.join(behaviors)}, or a policy")
     if asked.labels is not None:
         _check_labels(project, asked.labels)
     chosen = asked.model_copy(update={"behavior": behavior})  # what a worker does is decided when it is asked

@@ -286,6 +286,15 @@ class NoProvenance(ServiceError):
         super().__init__(f"trajectory {trajectory} has no provenance here")
 
 
+class PoliciesOutOfReach(ServiceError):
+    """The store of policies' weights is not in reach of this process."""
+
+    status_code = 404
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}: weights of policies are in the provenance store, which is not in reach here")
+
+
 class NotAllowed(ServiceError):
     """The key does not allow this."""
 

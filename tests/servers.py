@@ -1,6 +1,5 @@
-"""Real PostgreSQL and Redis for tests: the server that a variable names, a private one, or that on its usual port.
+"""Real PostgreSQL and Redis for tests: the server that a variable names, the one on its usual port, or a private one.
 
-A private PostgreSQL comes before one that is there and waits for its disk: tests make and drop databases by the dozen.
 Where none can be had a test is skipped and says so; with CI set it fails instead.
 """
 
@@ -43,15 +42,14 @@ class RedisSpace:
 def postgres_server() -> Iterator[str]:
     """URL of a PostgreSQL server in which databases may be made."""
     asked = os.environ.get("ASIM_TEST_DATABASE_URL")
-    if not asked and postgres_folder() is not None:
-        with PrivatePostgres() as server:
-            yield server.url
-        return
     for url in (asked,) if asked else POSTGRES_URLS:
         if postgres_answers(url):
             yield url
             return
-    _missing(f"PostgreSQL: {asked or POSTGRES_URLS[0]} does not answer, and no server is installed")
+    if asked or postgres_folder() is None:
+        _missing(f"PostgreSQL: {asked or POSTGRES_URLS[0]} does not answer, and no server is installed")
+    with PrivatePostgres() as server:
+        yield server.url
 
 
 @pytest.fixture
@@ -66,6 +64,7 @@ def postgres_database(server: str, template: str | None = None) -> Iterator[str]
     """A database with a random name, empty or a copy of `template`, which nobody uses now; dropped at the end."""
     name = f"asim_test_{uuid4().hex[:12]}"
     _in_server(server, f'CREATE DATABASE "{name}"' + (f' TEMPLATE "{template}"' if template else ""))
+    _in_server(server, f'ALTER DATABASE "{name}" SET synchronous_commit TO off')  # no test crashes a server it shares
     if template:  # PostgreSQL copies how far a sequence is logged; before a checkpoint a crash would set the copy back
         _in_server(server, "CHECKPOINT")
     try:

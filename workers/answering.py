@@ -16,8 +16,9 @@ from asim.errors import NotFound
 from workers.delivery import Answer
 from workers.explainers import Explainer, explainer_of
 from workers.recording import Arrays, Known, Provenance, Recording
+from workers.replay import Behaviors
 from workers.simulators.base import Observation, Simulator, SimulatorError, State
-from workers.simulators.catalog import make_simulator
+from workers.simulators.catalog import make_behavior, make_simulator
 from workers.unanswerable import EndedEarly, SimulatorFailed, UnexplainedStep
 
 KNOWN = 200  # labels that a search's first guesses are fitted on
@@ -41,14 +42,15 @@ class Answerer(Protocol):
 class SimulatorAnswerer:
     """Answers in a simulator of this process."""
 
-    def __init__(self, client: Client, project: Project) -> None:
-        """Raises ValueError where the project names no simulator, and what `make_simulator` does."""
+    def __init__(self, client: Client, project: Project, behaviors: Behaviors = make_behavior) -> None:
+        """behaviors: those that provenance tells of; by default the simulator's own, and labels of policies are
+        searched. Raises ValueError where the project names no simulator, and what `make_simulator` does."""
         environment = project.environment
         if environment.simulator is None:
             raise ValueError(f"project {project.id} names no simulator; its labels must come from elsewhere")
         self._client, self._project = client, project
         self._simulator = make_simulator(environment.simulator, environment.options)
-        self._explainer = _explainer(client, project, self._simulator)
+        self._explainer = _explainer(client, project, self._simulator, behaviors)
 
     @property
     def name(self) -> str:
@@ -69,7 +71,7 @@ class SimulatorAnswerer:
         self._simulator.close()
 
 
-def _explainer(client: Client, project: Project, simulator: Simulator) -> Explainer:
+def _explainer(client: Client, project: Project, simulator: Simulator, behaviors: Behaviors) -> Explainer:
     def provenance(trajectory: str) -> Provenance:
         return Provenance(*client.provenance(project.id, trajectory))
 
@@ -78,7 +80,7 @@ def _explainer(client: Client, project: Project, simulator: Simulator) -> Explai
             with suppress(NotFound):  # of the states of recordings that came from elsewhere
                 yield Known(_recording(client, project, label.trajectory, label.start), label.actions)
 
-    return explainer_of(simulator, provenance, known)
+    return explainer_of(simulator, provenance, known, behaviors)
 
 
 def _recording(client: Client, project: Project, trajectory: str, start: int) -> Recording:

@@ -17,6 +17,7 @@ from api_schemas.projects import Project
 from asim.client import Client
 from asim.errors import AsimError, ServiceError, Unreachable, service_error
 from workers.answering import SimulatorAnswerer
+from workers.behaviors import behaviors_of
 from workers.delivery import Answer
 from workers.orphans import end_with
 from workers.simulators.base import SimulatorError, SimulatorUnavailable
@@ -137,7 +138,7 @@ def _serve(pipe: Connection, url: str, key: str | None, project: UUID) -> None:
     end_with(os.getppid())
     with contextlib.suppress(EOFError, BrokenPipeError), Client(url, key) as client:
         try:
-            answerer = SimulatorAnswerer(client, client.project(project))
+            answerer = SimulatorAnswerer(client, client.project(project), behaviors_of(client, project))
         except (SimulatorError, AsimError) as error:
             pipe.send(SimulatorUnavailable(str(error)))
             return

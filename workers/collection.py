@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 
 from api_schemas.collections import CollectionCreate
 from api_schemas.environments import DEFAULT_BEHAVIORS, DiscreteActions
@@ -19,12 +20,13 @@ from service.store import codec
 from service.store.provenance import ProvenanceBlobs
 from service.store.queries import pool as pool_queries
 from service.store.tables import ProjectRow
+from workers.behaviors import behavior_named
 from workers.collection_record import CollectionRecord
 from workers.episodes import Episode, Extent, further_episodes
 from workers.job import RunningJob
 from workers.quotas import Quota, quota_of
-from workers.simulators.base import Simulator
-from workers.simulators.catalog import make_behavior, make_simulator
+from workers.simulators.base import Behavior, Simulator
+from workers.simulators.catalog import make_simulator
 from workers.standing import Standing
 
 BATCH = 25  # trajectories a transaction at most
@@ -51,7 +53,8 @@ def _collect(
     standing = record.standing
     quota = _quota(project, asked.collection, simulator)
     quota.taken = standing.labels
-    episodes = _new_episodes(job, project, asked.collection, simulator, standing)
+    behavior = behavior_named(_behavior(project, asked.collection), simulator, partial(provenance.get, "policies"))
+    episodes = _new_episodes(job, project, asked.collection, simulator, behavior, standing)
     while not quota.met and (batch := _next_batch(job, asked.collection, episodes, quota, standing)):
         _store(job, project, asked.collection, batch, provenance, record, quota)
     record.close()
@@ -72,10 +75,14 @@ def _next_batch(
 
 
 def _new_episodes(
-    job: RunningJob, project: ProjectRow, asked: CollectionCreate, simulator: Simulator, standing: Standing
+    job: RunningJob,
+    project: ProjectRow,
+    asked: CollectionCreate,
+    simulator: Simulator,
+    behavior: Behavior,
+    standing: Standing,
 ) -> Iterator[Episode]:
     """Episodes that neither were drawn before nor are in the other split already."""
-    behavior = make_behavior(_behavior(project, asked), simulator)
     standing.follow(behavior)
     extent, drawn = extent_of(asked), standing.drawn
 

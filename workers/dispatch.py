@@ -17,6 +17,7 @@ from api_schemas.jobs import (
     ProposeExplorations,
     ScoreShard,
     SelectQueue,
+    TrainPolicy,
     TrainRound,
     TrainSubgoalGenerator,
 )
@@ -107,6 +108,11 @@ def _run(job: RunningJob, payload: JobPayload) -> Result:
             from workers.collection import run_collection
 
             return run_collection(job, payload, open_provenance(job.worker.settings))
+        case TrainPolicy():
+            from service.store.provenance import open_provenance
+            from workers.policy_training import run_policy_training
+
+            return run_policy_training(job, payload.policy, open_provenance(job.worker.settings))
         case TrainRound():
             from workers.training import run_round
 

@@ -12,9 +12,10 @@ import numpy as np
 from workers.action_search import ActionSearch
 from workers.explanation import explain
 from workers.recording import Known, Provenances, Recording
-from workers.replay import Replay, leads
+from workers.replay import Behaviors, Replay, leads
 from workers.ridge_start import RidgeStart
 from workers.simulators.base import SearchableSimulator, Simulator
+from workers.simulators.catalog import make_behavior
 
 Actions = list[Any]  # integers, or lists of floats: as a label holds them
 
@@ -42,13 +43,18 @@ class Explainer(Protocol):
         """The same of a step whose action is known: `actions` holds it, or the simulator does not repeat itself."""
 
 
-def explainer_of(simulator: Simulator, provenances: Provenances, known: Callable[[], Iterable[Known]]) -> Explainer:
+def explainer_of(
+    simulator: Simulator,
+    provenances: Provenances,
+    known: Callable[[], Iterable[Known]],
+    behaviors: Behaviors = make_behavior,
+) -> Explainer:
     """The explainer that fits the simulator's actions. known: labels of the project, asked for where a search needs a
     start. Raises ValueError for an action space that it has no way for."""
     if isinstance(simulator.action_space, gym.spaces.Discrete):
         return Enumeration(simulator)
     if isinstance(simulator.action_space, gym.spaces.Box) and isinstance(simulator, SearchableSimulator):
-        return ReplayOrSearch(simulator, provenances, known)
+        return ReplayOrSearch(simulator, provenances, known, behaviors)
     raise ValueError(f"the actions of a {type(simulator).__name__}, {simulator.action_space}, can be found in no way")
 
 
@@ -76,10 +82,14 @@ class ReplayOrSearch:
     is_exhaustive = False
 
     def __init__(
-        self, simulator: SearchableSimulator, provenances: Provenances, known: Callable[[], Iterable[Known]]
+        self,
+        simulator: SearchableSimulator,
+        provenances: Provenances,
+        known: Callable[[], Iterable[Known]],
+        behaviors: Behaviors = make_behavior,
     ) -> None:
         self._simulator, self._known = simulator, known
-        self._replay, self._search = Replay(simulator, provenances), ActionSearch(simulator)
+        self._replay, self._search = Replay(simulator, provenances, behaviors), ActionSearch(simulator)
         self._start: RidgeStart | None = None
 
     def explain(self, recording: Recording, step: int) -> Explained:

@@ -3,21 +3,27 @@
 The simulator is exact, so going through the recorded states is the run itself; only what is labeled need be stepped.
 """
 
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workers.recording import Provenance, Provenances, Recording
-from workers.simulators.base import Behavior, OptionError, SearchableSimulator
+from workers.simulators.base import Behavior, OptionError, SearchableSimulator, Simulator
 from workers.simulators.catalog import make_behavior
+
+Behaviors = Callable[[str, Simulator], Behavior]
+"""A behavior by its name, for a simulator. Raises OptionError for a name of none."""
 
 
 class Replay:
     """Actions of whole trajectories, by the behavior, the states and the generator that their provenance tells of."""
 
-    def __init__(self, simulator: SearchableSimulator, provenances: Provenances) -> None:
-        self._simulator, self._provenances = simulator, provenances
+    def __init__(
+        self, simulator: SearchableSimulator, provenances: Provenances, behaviors: Behaviors = make_behavior
+    ) -> None:
+        self._simulator, self._provenances, self._behaviors = simulator, provenances, behaviors
         self._played: dict[str, list[Any]] = {}  # by trajectory; empty where there is nothing to replay
 
     def action(self, recording: Recording, step: int) -> NDArray[Any] | None:
@@ -46,7 +52,7 @@ class Replay:
         if "generator" not in provenance.told:  # what was collected by older versions
             return None
         try:
-            return make_behavior(str(provenance.told["behavior"]), self._simulator)
+            return self._behaviors(str(provenance.told["behavior"]), self._simulator)
         except OptionError:  # one that this version does not have
             return None
 

@@ -104,7 +104,7 @@ class Stage:
         """Replace the checkpoint by one that is further; that is progress, so attempts count anew."""
         if state.step <= self._stored:
             return
-        sha256 = self._checkpoint.write(_own(self._job.lease.job_id, state).to_bytes())
+        sha256 = self._checkpoint.write(own(self._job.lease.job_id, state).to_bytes())
         with self._job.transaction() as session:
             replaced = self._checkpoint.refer(session, sha256)
             jobs.made_progress(session, self._job.lease)
@@ -112,7 +112,7 @@ class Stage:
         self._checkpoint.discard(replaced)
 
 
-def _own(job_id: UUID, state: TrainingState) -> TrainingState:
+def own(job_id: UUID, state: TrainingState) -> TrainingState:
     """The state under the job's name: equal states of two jobs are two blobs, and deleting one keeps the other."""
     name = torch.tensor(list(job_id.bytes), dtype=torch.uint8)
     return replace(state, tensors={**state.tensors, "job": name})

@@ -105,7 +105,7 @@ def collect(
     *,
     transitions: Annotated[int | None, typer.Option(min=1, help="Transitions to collect.")] = None,
     trajectories: Annotated[int | None, typer.Option(min=1, help="Or whole trajectories.")] = None,
-    behavior: Annotated[str | None, typer.Option(help="random, expert, ...; default the simulator's own.")] = None,
+    behavior: Annotated[str | None, typer.Option(help="random, expert, policy:ID; default the simulator's.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of layouts and actions.")] = 0,
     split: Split = "auto",
     labels_per_action: Annotated[

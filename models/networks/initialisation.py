@@ -1,10 +1,13 @@
 """Layers whose parameters come from a torch.Generator and never from the global one."""
 
 import math
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import skip_init
+
+Layer = TypeVar("Layer", nn.Linear, nn.Conv1d)
 
 
 def linear(inputs: int, outputs: int) -> nn.Linear:
@@ -13,11 +16,25 @@ def linear(inputs: int, outputs: int) -> nn.Linear:
     return layer
 
 
-def convolution(inputs: int, outputs: int, kernel: int) -> nn.Conv2d:
-    """A same-size 2-D convolution with unset parameters; `initialise` sets them."""
+def convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Conv2d:
+    """A 2-D convolution of 1/stride of the size with unset parameters; `initialise` sets them."""
     layer: nn.Conv2d = skip_init(  # type: ignore[no-untyped-call]  # untyped in torch
-        nn.Conv2d, inputs, outputs, kernel, padding=kernel // 2
+        nn.Conv2d, inputs, outputs, kernel, stride=stride, padding=kernel // 2
     )
+    return layer
+
+
+def temporal_convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Conv1d:
+    """A 1-D convolution of 1/stride of the length with unset parameters; `initialise` sets them."""
+    layer: nn.Conv1d = skip_init(  # type: ignore[no-untyped-call]  # untyped in torch
+        nn.Conv1d, inputs, outputs, kernel, stride=stride, padding=kernel // 2
+    )
+    return layer
+
+
+def weak(layer: Layer, scale: float) -> Layer:
+    """The layer, whose weights are to be drawn from N(0, scale^2)."""
+    layer.weight.initial_scale = scale  # type: ignore[attr-defined]  # read back by initialise
     return layer
 
 

@@ -10,7 +10,7 @@ from api_schemas.collections import CollectionCreate
 from api_schemas.jobs import CollectionStarted
 from api_schemas.trajectories import SplitChoice, TrajectoriesAdded, Trajectory
 from service import collections, pool, projects, streams
-from service.api.access import by_body, by_query, requires
+from service.api.access import CallerDep, by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
 from service.api.description import refuses
 from service.errors import (
@@ -126,9 +126,9 @@ def trajectory_provenance(
     dependencies=[requires("admin", by_body)],
 )
 def collect(
-    request: CollectionCreate, session: WriteSession, held: ServicesDep, now: Now, response: Response
+    request: CollectionCreate, session: WriteSession, held: ServicesDep, who: CallerDep, now: Now, response: Response
 ) -> CollectionStarted:
-    rows = collections.request(session, request, now, held.settings.job_max_attempts)
+    rows = collections.request(session, request, now, held.settings.job_max_attempts, who.project)
     response.headers.update({"Location": f"/jobs/{rows[0].id}", "Retry-After": "1"})
     return collections.started(rows)
 

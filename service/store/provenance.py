@@ -8,9 +8,12 @@ from service.store.blobs import Blobs
 
 
 class ProvenanceBlobs(Blobs):
-    """Immutable bytes, one object a trajectory: every array of the simulator's state, time first."""
+    """Immutable bytes. `provenance`, one object a trajectory: every array of the simulator's state, time first.
+    `policies`: weights of policies, which would give away what a trajectory's actions were. `trainings`: the states
+    that trainings of policies go on from.
+    """
 
-    kinds = ("provenance",)
+    kinds = ("provenance", "policies", "trainings")
 
 
 def open_provenance(settings: Settings) -> ProvenanceBlobs | None:

@@ -26,6 +26,8 @@ COMMANDS: list[list[str]] = [
     ["project", "create"],
     ["key"],
     ["db"],
+    ["policy"],
+    *(["policy", name] for name in ("train", "list")),
     *(["db", name] for name in ("upgrade", "copy")),
     *(["key", name] for name in ("create", "list", "revoke")),
     *(

@@ -67,7 +67,7 @@ def endpoints(served: Served) -> list[Endpoint]:
 
 
 def fill(served: Served, name: str, seed: int) -> Things:
-    """A project with a trajectory, a lease, a job, a round and a model of its own."""
+    """A project with a trajectory, a lease, a job, a round, a model and a policy of its own."""
     project = served.project(name=name)
     trajectory = served.upload(project, room(seed, transitions=8))[0]["id"]
     item: Json = {"trajectory": trajectory, "start": 0, "actions": [0]}
@@ -86,6 +86,7 @@ def fill(served: Served, name: str, seed: int) -> Things:
         "acquisition_id": batch["id"],
         "round_id": str(asked.id),
         "model_id": str(model.id),
+        "policy_id": served.policy(project, weights),
         "job_id": str(asked.job_id),
         "key_id": key["id"],
     }

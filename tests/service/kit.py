@@ -19,6 +19,8 @@ from httpx2 import Response
 from numpy.typing import NDArray
 
 from api_schemas.errors import PROBLEM_JSON, Problem
+from api_schemas.policies import PolicyCreate
+from service import policies
 from service.api.dependencies import Services
 from service.app import create_app
 from service.settings import Settings
@@ -121,6 +123,16 @@ class Served:
         answer = self.send(project, files, **query)
         assert answer.status_code == 201, answer.text
         return list(answer.json()["items"])
+
+    def policy(self, project: str, weights: bytes, state: bytes | None = None) -> str:
+        """The id of a new policy of the project, of a training that goes on from a state if one is given."""
+        store = self.services.provenance
+        assert store is not None
+        left = None if state is None else store.put("trainings", state)
+        stage = policies.Stage(store.put("policies", weights), len(weights), left, 0, 10, 0.5, 2)
+        with self.services.database.write() as session:
+            policies.keep(session, uuid4(), PolicyCreate(project=UUID(project)), stage, self.clock())
+        return stage.sha256
 
     def ask(self, project: str, count: int = 1, **fields: Any) -> Response:
         """POST /acquire as it answers."""

@@ -1,5 +1,6 @@
 """Blobs that nothing refers to go in two steps, and none that somebody needs is lost."""
 
+import hashlib
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -78,3 +79,16 @@ def test_states_are_collected_like_everything_else(holding: Served) -> None:
     lost = provenance.put("provenance", b"states")
     assert [(blob.kind, blob.sha256) for blob in collected(holding, 2 * DAY).discarded] == [("provenance", lost)]
     assert names(provenance) == set()
+
+
+def test_policies_and_what_their_training_goes_on_from_are_kept_as_long_as_a_row_needs_them(holding: Served) -> None:
+    provenance = holding.services.provenance
+    assert provenance is not None
+    kept = {holding.policy(holding.project(), b"weights", state) for state in (None, b"state")}
+    lost = [provenance.put(kind, b"of a training that was lost") for kind in ("policies", "trainings")]
+    assert {(blob.kind, blob.sha256) for blob in collected(holding, 2 * DAY).discarded} == {
+        ("policies", lost[0]),
+        ("trainings", lost[1]),
+    }
+    assert {blob.sha256 for blob in provenance.stored() if blob.kind == "policies"} == kept
+    assert provenance.get("trainings", hashlib.sha256(b"state").hexdigest()) == b"state"

@@ -205,3 +205,28 @@ def test_rounds_of_the_other_kind_of_world_model_end(url: str, forth: bool) -> N
     check_references(url)
     migrate(url)
     assert differences(url) == []
+
+
+def test_going_back_before_policies_forgets_them_and_their_trainings(url: str) -> None:
+    migrate(url, "0001")
+    fill(url)
+    migrate(url, "0009")
+    before, schema = read(url), schema_of(url)
+    migrate(url, "0010")
+    project = quoted(url, FIRST)
+    columns = "project_id, sha256, training_id, observations, stage, stages, steps, success, episodes, bytes"
+    values = f"'{project}', '{'0' * 64}', '{project}', 'state', 0, 10, 30, 0.5, 10, 1000"
+    write(
+        url,
+        f"INSERT INTO policy ({columns}, created_at) SELECT {values}, created_at FROM project WHERE id = '{project}'",
+        "UPDATE job SET kind = 'train_policy' WHERE state = 'queued'",
+    )
+    assert [row["state_sha256"] for row in read(url)["policy"]] == [None]
+    downgrade(url, "0009")
+    after = read(url)
+    assert (version(url), schema_of(url)) == ("0009", schema)
+    assert after.pop("job") == [row for row in before["job"] if row["state"] != "queued"]
+    assert after == {name: rows for name, rows in before.items() if name != "job"}
+    check_references(url)
+    migrate(url)
+    assert differences(url) == []

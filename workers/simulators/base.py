@@ -116,6 +116,14 @@ class SearchableSimulator(Simulator, Protocol):
         gradually."""
 
 
+@runtime_checkable
+class ArrangedSimulator(Simulator, Protocol):
+    """A simulator that can tell where everything is, whatever its observations show of that."""
+
+    def arrangement(self) -> Observation:
+        """What decides how to act in the current state, as vectors."""
+
+
 class Behavior(Protocol):
     """Chooses actions in a simulator's current state. All chance comes from the generator it is handed."""
 

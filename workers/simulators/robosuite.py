@@ -83,11 +83,14 @@ class RobosuiteSimulator:
 
     def numbers(self) -> Observation:
         """The current observation but for its images."""
+        seen = self.arrangement()
+        return {"proprioception": seen["proprioception"]} if self.options.cameras else seen
+
+    def arrangement(self) -> Observation:
+        """What is observed without cameras."""
         arm = robot_observation.proprioception(self.view.grip(), self.view.fingers())
-        if self.options.cameras:
-            return {"proprioception": arm}
-        bodies = map(self.view.body, TASKS[self.options.task].bodies)
-        return {"proprioception": arm, "objects": robot_observation.objects(bodies)}
+        objects = map(self.view.body, TASKS[self.options.task].bodies)
+        return {"proprioception": arm, "objects": robot_observation.objects(objects)}
 
     @property
     def search(self) -> SearchSettings:

@@ -21,16 +21,16 @@ class RandomBehavior:
 
 class NoisyBehavior:
     """Another behavior's actions with Gaussian noise on all numbers but the gripper's. An episode's standard deviation
-    is drawn uniformly from 0 to LOUDEST, so that some episodes go well and some badly."""
+    is drawn uniformly from 0 to `loudest`, so that some episodes go well and some badly."""
 
     LOUDEST = 0.6
 
-    def __init__(self, behavior: Behavior) -> None:
-        self._behavior, self._deviation = behavior, 0.0
+    def __init__(self, behavior: Behavior, loudest: float = LOUDEST) -> None:
+        self._behavior, self._loudest, self._deviation = behavior, loudest, 0.0
 
     def reset(self, rng: np.random.Generator) -> None:
         """Draws how noisy the episode is."""
-        self._deviation = float(rng.uniform(0, self.LOUDEST))
+        self._deviation = float(rng.uniform(0, self._loudest))
         self._behavior.reset(rng)
 
     def act(self, simulator: Simulator, rng: np.random.Generator) -> NDArray[np.float32]:

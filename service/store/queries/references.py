@@ -6,7 +6,7 @@ from typing import NamedTuple
 from sqlalchemy import select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from service.store.tables import JobRow, MembershipRow, ModelVersionRow, ShardRow, TrajectoryRow
+from service.store.tables import JobRow, MembershipRow, ModelVersionRow, PolicyRow, ShardRow, TrajectoryRow
 
 PROVENANCE = "provenance"
 COLUMNS: dict[str, InstrumentedAttribute[str] | InstrumentedAttribute[str | None]] = {
@@ -15,11 +15,13 @@ COLUMNS: dict[str, InstrumentedAttribute[str] | InstrumentedAttribute[str | None
     "scores": ShardRow.blob_sha256,
     "checkpoints": JobRow.checkpoint_sha256,
     PROVENANCE: MembershipRow.provenance_sha256,
+    "policies": PolicyRow.sha256,
+    "trainings": PolicyRow.state_sha256,
 }
 
 
 class Reference(NamedTuple):
-    """One blob. Those of the kind PROVENANCE are in a store of their own."""
+    """One blob. Which store holds it follows from its kind."""
 
     kind: str
     sha256: str

@@ -3,6 +3,7 @@
 from service.store.tables.access import EventEpochRow, EventRow, IdempotencyRow, KeyRow
 from service.store.tables.acquisitions import AcquisitionItemRow, AcquisitionRow, ClaimRow
 from service.store.tables.jobs import JobRow, WorkerRow
+from service.store.tables.policies import PolicyRow
 from service.store.tables.pools import LabelRow, MembershipRow, ProjectRow, TrajectoryRow
 from service.store.tables.rounds import ModelVersionRow, RoundRow
 from service.store.tables.scorings import QueueRow, ScoringRow, ShardRow
@@ -19,6 +20,7 @@ __all__ = [
     "LabelRow",
     "MembershipRow",
     "ModelVersionRow",
+    "PolicyRow",
     "ProjectRow",
     "QueueRow",
     "RoundRow",

@@ -1,0 +1,50 @@
+"""asim policy: what robots do at stages of learning, to be rolled out by asim collect."""
+
+import json
+from typing import Annotated
+
+import typer
+
+from asim.commands.console import DEFAULT_URL, JsonLines, Key, ProjectName, Url, connect
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.command("train")
+def train(
+    project: ProjectName,
+    *,
+    demonstrations: Annotated[int, typer.Option(min=1, max=1000, help="Episodes of the expert to learn from.")] = 100,
+    stages: Annotated[int, typer.Option(min=1, max=20, help="Of training, each kept as a policy.")] = 10,
+    observations: Annotated[str, typer.Option(help="What it acts by: state or images.")] = "state",
+    seed: Annotated[int, typer.Option(min=0, help="Of demonstrations and training.")] = 0,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Train a diffusion policy on demonstrations of the project's task; wait until its stages are there.
+
+    asim collect --behavior policy:ID rolls one out.
+    """
+    from api_schemas.policies import PolicyCreate
+    from asim.report import Report
+
+    with connect(url, key) as client, Report() as report, report.step(f"train a policy of {project}") as advance:
+        fields = {"demonstrations": demonstrations, "stages": stages, "observations": observations, "seed": seed}
+        asked = PolicyCreate.model_validate({"project": client.find_project(project).id, **fields})
+        job = client.train_policy(asked)
+        done = client.wait_for_job(job.id, progress=lambda seen: advance(seen.progress, seen.message))
+    typer.echo(json.dumps(done.result))
+
+
+@app.command("list")
+def list_policies(project: ProjectName, *, as_json: JsonLines = False, url: Url = DEFAULT_URL, key: Key = None) -> None:
+    """The policies of a project, oldest first: at which stage of training each is, and how often it succeeds."""
+    from asim.tables import policy_table, show
+
+    with connect(url, key) as client:
+        found = list(client.policies(client.find_project(project).id))
+    if not as_json:
+        show(policy_table(found))
+        return
+    for policy in found:
+        typer.echo(policy.model_dump_json())

@@ -1,0 +1,57 @@
+"""Demonstrations: successful episodes of a task's expert, and the segments that a policy learns from."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+
+from models.segments import Segment, SegmentBatch
+from workers.policies import Form, look
+from workers.rollouts import Rollout, rollout
+from workers.simulators.base import Simulator, SimulatorError
+from workers.simulators.catalog import make_behavior
+
+EXPERT = "expert"
+FIRST_OTHER = 2**30  # the simulator's seeds of demonstrations are below it; a policy is tried on those from it on
+TRIES = 3  # times as many episodes as there are to be demonstrations
+
+
+def demonstrate(
+    simulator: Simulator, form: Form, count: int, seed: int, on_step: Callable[[int], None] = lambda done: None
+) -> list[Rollout]:
+    """`count` episodes that the expert solved, decided by the seed.
+
+    on_step: told how many there are; may raise to stop. Raises SimulatorError where the expert fails too often.
+    """
+    expert, rng, solved = make_behavior(EXPERT, simulator), np.random.default_rng(seed), list[Rollout]()
+
+    def tell() -> None:
+        on_step(len(solved))
+
+    for _ in range(TRIES * count):
+        at = int(rng.integers(FIRST_OTHER))
+        episode = rollout(simulator, expert, at, rng, partial(look, simulator, form), tell)
+        solved += [episode] if episode.is_solved else []
+        if len(solved) == count:
+            return solved
+    raise SimulatorError(f"The expert solved {len(solved)} of {TRIES * count} episodes; {count} were asked for.")
+
+
+def segments(demonstrations: list[Rollout], chunk: int) -> SegmentBatch:
+    """One for every action: observations (B, 2, ...) and the actions from the second one on, (B, 1, chunk, D).
+
+    Before its start and after its end an episode is taken to stand still, and its last action to go on.
+    """
+    observations: dict[str, list[torch.Tensor]] = {name: [] for name in demonstrations[0].seen[0]}
+    actions, names = [], []
+    for number, episode in enumerate(demonstrations):
+        now = np.arange(len(episode.actions))
+        before, ahead = np.maximum(now - 1, 0), np.minimum(now[:, None] + np.arange(chunk), now[-1])
+        for name, parts in observations.items():
+            stream = np.stack([seen[name] for seen in episode.seen])
+            parts.append(torch.from_numpy(np.stack([stream[before], stream[now]], 1)))
+        actions.append(torch.from_numpy(np.stack(episode.actions)[ahead])[:, None])  # (T, chunk, D) -> (T, 1, chunk, D)
+        names += [Segment(f"demonstration {number}", int(step)) for step in now]
+    seen = {name: torch.cat(parts) for name, parts in observations.items()}
+    return SegmentBatch(seen, torch.cat(actions), segments=tuple(names))
