@@ -55,7 +55,7 @@ def postgres_server() -> Iterator[str]:
 @pytest.fixture
 def postgres_url(postgres_server: str) -> Iterator[str]:
     """URL of an empty database of the test's own."""
-    with postgres_database(postgres_server) as url:
+    with shared_database(postgres_server) as url:
         yield url
 
 
@@ -64,13 +64,20 @@ def postgres_database(server: str, template: str | None = None) -> Iterator[str]
     """A database with a random name, empty or a copy of `template`, which nobody uses now; dropped at the end."""
     name = f"asim_test_{uuid4().hex[:12]}"
     _in_server(server, f'CREATE DATABASE "{name}"' + (f' TEMPLATE "{template}"' if template else ""))
-    _in_server(server, f'ALTER DATABASE "{name}" SET synchronous_commit TO off')  # no test crashes a server it shares
     if template:  # PostgreSQL copies how far a sequence is logged; before a checkpoint a crash would set the copy back
         _in_server(server, "CHECKPOINT")
     try:
         yield make_url(server).set(database=name).render_as_string(hide_password=False)
     finally:
         _in_server(server, f'DROP DATABASE "{name}" WITH (FORCE)')
+
+
+@contextmanager
+def shared_database(server: str, template: str | None = None) -> Iterator[str]:
+    """The same on a server that no test crashes: no commit waits for its disk."""
+    with postgres_database(server, template) as url:
+        _in_server(server, f'ALTER DATABASE "{make_url(url).database}" SET synchronous_commit TO off')
+        yield url
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from service.settings import Settings
 from service.store.columns import Row
 from service.store.database import migrate
 from tests.command import command
-from tests.servers import postgres_database
+from tests.servers import shared_database
 from tests.service.kit import MAX_BODY_BYTES, START, Served, serve
 
 __all__ = ["command"]
@@ -73,7 +73,7 @@ def served(_embedded: Served) -> Iterator[Served]:
 
 @pytest.fixture(scope="session")
 def _postgres_schema(postgres_server: str) -> Iterator[str]:
-    with postgres_database(postgres_server) as url:
+    with shared_database(postgres_server) as url:
         migrate(url)
         yield url
 

@@ -23,7 +23,7 @@ from service.store.errors import BackupExists, NoDatabase, NotEmpty, UnreadableB
 from service.store.provenance import ProvenanceBlobs
 from service.store.tables import EventEpochRow, EventRow, KeyRow, MembershipRow
 from tests.command import Command
-from tests.servers import postgres_database
+from tests.servers import shared_database
 from tests.service.access_table import fill
 from tests.service.kit import Clock, Served, answers, room, serve
 
@@ -56,7 +56,7 @@ def prepared(
     with ExitStack() as stack:
         url = ""
         if request.param == "postgresql":
-            url = stack.enter_context(postgres_database(postgres_server))
+            url = stack.enter_context(shared_database(postgres_server))
             migrate(url)
         settings = Settings(data_folder=tmp_path_factory.mktemp("prepared") / "source", database_url=url)
         with closing(serve(settings)) as served:
@@ -70,7 +70,7 @@ def prepared(
 def filled(prepared: Prepared, tmp_path: Path, postgres_server: str) -> Iterator[Served]:
     """A service on a copy of it, with a database of its own."""
     with ExitStack() as stack:
-        url = stack.enter_context(postgres_database(postgres_server, prepared.database)) if prepared.database else ""
+        url = stack.enter_context(shared_database(postgres_server, prepared.database)) if prepared.database else ""
         shutil.copytree(prepared.folder, tmp_path / "source")
         clock = Clock()
         clock.now = prepared.now
