@@ -36,6 +36,34 @@ def train(
     typer.echo(json.dumps(done.result))
 
 
+@app.command("collect")
+def collect(
+    project: ProjectName,
+    *,
+    trajectories: Annotated[int, typer.Option(min=4, help="In all, shared evenly among expert and stages.")] = 1500,
+    seed: Annotated[int, typer.Option(min=0, help="Of layouts and actions.")] = 0,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Share each part among so many jobs.")] = 1,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Roll out what was trained last, as in the paper: warm-up, pool and validation; wait until they are there.
+
+    The expert and the best stage are the warm-up, labeled; one imperfect stage validates, labeled and held out; the
+    other stages are the pool.
+    """
+    from asim.collecting import await_collection
+    from asim.policy_parts import parts_of
+    from asim.report import Report
+
+    with connect(url, key) as client, Report() as report:
+        found = client.find_project(project)
+        for number, part in enumerate(parts_of(list(client.policies(found.id)), trajectories)):
+            asked = part.collection(found.id, seed, number, jobs)
+            with report.step(f"{part.name}: {part.trajectories} trajectories of {part.behavior[:15]}") as advance:
+                done = await_collection(client, client.collect(asked), advance)
+            typer.echo(json.dumps({"part": part.name, "behavior": part.behavior, **done}))
+
+
 @app.command("list")
 def list_policies(project: ProjectName, *, as_json: JsonLines = False, url: Url = DEFAULT_URL, key: Key = None) -> None:
     """The policies of a project, oldest first: at which stage of training each is, and how often it succeeds."""

@@ -14,7 +14,8 @@ from api_schemas.jobs import Job
 from api_schemas.policies import Policy, PolicyCreate
 from api_schemas.projects import Project, ProjectCreate
 from asim.client import Client
-from asim.errors import Conflict, Invalid, NotFound
+from asim.errors import AsimError, Conflict, Invalid, NotFound
+from asim.policy_parts import parts_of
 from models import checkpoints
 from models.policies.diffusion import training_config
 from models.spaces import Spaces
@@ -237,3 +238,34 @@ def test_a_policy_of_images_learns_from_pictures(opened: OpenLoop) -> None:
     (policy,) = policies(loop)
     assert (policy.observations, policy.steps) == ("images", STEPS)
     assert loop.collect(3, behavior=f"policy:{policy.id}", split="pool").state == "done"
+
+
+def test_a_training_gives_warm_up_pool_and_validation(loop: Loop) -> None:
+    trained(loop)
+    found = [
+        policy.model_copy(update={"success": success})
+        for policy, success in zip(policies(loop), (0, 0.4, 1), strict=True)
+    ]
+    parts = parts_of(found, 9)
+    behaviors = ["expert", *(f"policy:{found[stage].id}" for stage in (2, 0, 1))]
+    assert [(part.name, part.behavior, part.trajectories) for part in parts] == list(
+        zip(("warm-up", "warm-up", "pool", "validation"), behaviors, (3, 2, 2, 2), strict=True)
+    )
+    asked = [part.collection(loop.project.id, 0, number, 1) for number, part in enumerate(parts)]
+    assert len({each.seed for each in asked}) == len(parts)
+    for each in asked:
+        loop.client.collect(each)
+    loop.drain()
+    counts, labels = loop.project.counts, list(loop.client.labels(loop.project.id))
+    held_out = {each.id for each in loop.client.trajectories(loop.project.id) if each.split == "held_out"}
+    assert (counts.pool_trajectories, len(held_out)) == (7, 2)
+    labeled = {label.trajectory for label in labels}
+    assert held_out < labeled
+    assert len(labeled) == 7  # all but the pool's two
+
+
+@pytest.mark.parametrize(("stages", "trajectories"), [(0, 9), (2, 9), (3, 3)])
+def test_too_few_stages_or_trajectories_are_said(loop: Loop, stages: int, trajectories: int) -> None:
+    trained(loop)
+    with pytest.raises(AsimError, match=f"^({stages} stages of a policy|trajectories: {trajectories} cannot)"):
+        parts_of(policies(loop)[:stages], trajectories)
