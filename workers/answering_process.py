@@ -24,7 +24,6 @@ from workers.unanswerable import ProcessEnded, UnanswerableItem
 
 START_SECONDS = 300.0  # to import a simulator and make its scene
 IN_A_ROW = 3  # items that cost a process each, after which no other is started
-Asked = tuple[AcquisitionItem, np.random.Generator]
 
 
 @dataclass(frozen=True)
