@@ -129,5 +129,5 @@ def _kill_labeler(robots: Robots, chance: random.Random, seconds: float) -> list
     struck = labeler.poll() is None
     labeler.kill()
     labeler.wait()
-    eventually(lambda: not any(map(command_of, simulators)), 10, "a simulator outlives its labeler")
+    eventually(lambda: not any(map(command_of, simulators)), 60, "a simulator outlives its labeler")
     return ["labeler"] * struck
