@@ -53,7 +53,7 @@ audit: setup-robots ## known vulnerabilities of everything installed (asks PyPI;
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[audit]'
 	$(BIN)/python scripts/audit.py
 
-test-robots: setup-robots ## the long tests of the robot simulators: whole episodes replayed
+test-robots: setup-robots ## the long tests of the robot simulators: whole episodes replayed, kills at random moments
 	$(BIN)/python -m pytest -m robots
 
 lint: setup ## ruff

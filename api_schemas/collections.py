@@ -3,7 +3,7 @@
 from typing import Annotated
 from uuid import UUID
 
-from pydantic import Field, model_validator
+from pydantic import Field, Strict, model_validator
 
 from api_schemas.base import AS_JSON, Positive, Schema, Seed
 from api_schemas.trajectories import SplitChoice
@@ -21,7 +21,7 @@ class CollectionLabels(Schema):
 
     per_action: Positive | None = None
     segments: Positive | None = None
-    all: bool = False
+    all: Annotated[bool, Strict()] = False
 
     @model_validator(mode="after")
     def _one_way(self) -> "CollectionLabels":

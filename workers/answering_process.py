@@ -25,7 +25,6 @@ from workers.unanswerable import ProcessEnded, UnanswerableItem
 
 START_SECONDS = 300.0  # to import a simulator and make its scene
 IN_A_ROW = 3  # items that cost a process each, after which no other is started
-Asked = tuple[AcquisitionItem, np.random.Generator]
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class AnsweringProcess:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(theirs, *self._service, self._project), name="simulator", daemon=True
+            target=_serve, args=(theirs, os.getpid(), *self._service, self._project), name="simulator", daemon=True
         )
         self._process.start()
         theirs.close()
@@ -132,10 +131,10 @@ def _told(answered: Answered) -> Answer:
     return answered.answer
 
 
-def _serve(pipe: Connection, url: str, key: str | None, project: UUID) -> None:
-    """The child: answers what comes, until its parent is gone."""
+def _serve(pipe: Connection, parent: int, url: str, key: str | None, project: UUID) -> None:
+    """The child: answers what comes, until its parent is gone, which may be so already."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal is the parent's, which then ends this one
-    end_with(os.getppid())
+    end_with(parent)
     with contextlib.suppress(EOFError, BrokenPipeError), Client(url, key) as client:
         try:
             answerer = SimulatorAnswerer(client, client.project(project), behaviors_of(client, project))

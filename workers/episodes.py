@@ -73,15 +73,13 @@ class Extent:
 
     def share(self, drawn: Drawn) -> float:
         """Of it that is drawn, from 0 to 1."""
-        return (
-            drawn.transitions / self.transitions if self.transitions else drawn.trajectories / (self.trajectories or 1)
-        )
+        done, of = self._counted(drawn)
+        return done / max(1, of)
 
     def told(self, drawn: Drawn) -> str:
         """The same in words."""
-        return "{} of {} {}".format(
-            *self._counted(drawn), "trajectories" if self.transitions is None else "transitions"
-        )
+        done, of = self._counted(drawn)
+        return f"{done} of {of} {'trajectories' if self.transitions is None else 'transitions'}"
 
     def _counted(self, drawn: Drawn) -> tuple[int, int]:
         """How much of how much."""

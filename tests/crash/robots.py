@@ -16,10 +16,9 @@ from tests.crash.deployment import children_of
 from tests.loop.processes import Serving, command_of, environment, eventually
 from tests.loop.rows import check_rows, snapshot
 
-PATIENT = {"ASIM_JOB_LEASE_SECONDS": "2", "ASIM_JOB_MAX_ATTEMPTS": "50"}
+PATIENT = {"ASIM_JOB_LEASE_SECONDS": "4", "ASIM_JOB_MAX_ATTEMPTS": "50"}
 LEASE_SECONDS = 10.0  # of a batch: what a dead labeler held is free again then
 TASK = Environment(simulator="maniskill", options={"task": "PullCube", "cameras": False, "horizon": 15})
-CAMERAS = Environment(simulator="maniskill", options={"task": "PullCube", "cameras": True, "horizon": 15})
 WORK_SECONDS = 300.0
 
 
@@ -36,10 +35,10 @@ class Robots:
         self.client.close()
         self.serving.close()
 
-    def project(self, name: str, task: Environment = TASK) -> Project:
+    def project(self, name: str) -> Project:
         """A new one, whose leases are short."""
         policy = LabelingPolicy(strategy="random", round_labels=0, lease_seconds=LEASE_SECONDS)
-        return self.client.create_project(ProjectCreate(name=name, environment=task, policy=policy))
+        return self.client.create_project(ProjectCreate(name=name, environment=TASK, policy=policy))
 
     def collect(self, project: UUID, **asked: object) -> Job:
         """Ask for a collection, without waiting."""

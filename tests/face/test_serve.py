@@ -105,6 +105,8 @@ def test_only_the_collector_can_reach_simulator_states(tmp_path: Path) -> None:
     assert "ASIM_PROVENANCE_URL" not in runner_environment(settings, COLLECTOR_QUEUES)
     queues = [each.argv[each.argv.index("--queues") + 1] for each in runner_processes(settings, 2)]
     assert queues == ["train,score,default", "train,score,default", "label"]
+    names = [each.name for each in runner_processes(settings, 1, collectors=3)]
+    assert names == ["runner 1", "collector", "collector 2", "collector 3"]
     assert runner_processes(Settings(data_folder=tmp_path, broker_url="redis://127.0.0.1"), 2) == []
 
 

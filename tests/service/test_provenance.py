@@ -98,6 +98,7 @@ def test_a_collection_that_cannot_run_is_refused(served: Served) -> None:
         ({"trajectories": 3, "shards": 4}, "shards: 4 of them cannot share 3 trajectories"),
         ({"transitions": 9, "shards": 4, "labels": {"per_action": 2}}, "shards: 4 of them cannot share 2 labels"),
         ({"transitions": 9, "shards": 65}, "less than or equal to 64"),
+        ({"transitions": 9, "labels": {"all": 1}}, "labels.all: Input should be a valid boolean"),
         ({"transitions": 9, "labels": {}}, "labels: give per_action, segments or all, and one of them only"),
         ({"transitions": 9, "labels": {"all": True, "segments": 2}}, "and one of them only"),
     ],
