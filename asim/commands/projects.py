@@ -10,9 +10,10 @@ from asim.commands.console import DEFAULT_URL, Key, ProjectName, Split, Strategy
 from asim.errors import AsimError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from api_schemas.environments import Environment
 
-UPLOAD_FILES, UPLOAD_BYTES = 200, 32 * 2**20  # of one request, so that no upload meets the service's limit
 app = typer.Typer(no_args_is_help=True)
 RoundLabels = Annotated[int | None, typer.Option(min=0, help="New pool labels that start a round; 0: none does.")]
 LabelBudget = Annotated[int | None, typer.Option(min=1, help="Pool labels that may be spent in all.")]
@@ -144,20 +145,22 @@ def import_files(
     An npz file holds one array for each observation stream of the project, time first, T + 1 rows. With a further
     array `actions` of T rows it is a labeled trajectory: all its segments are labeled at once.
     """
-    from asim.batches import batches
-    from asim.importing import add_labeled, has_actions
+    from asim.importing import add_labeled, add_plain, has_actions
 
     with connect(url, key) as client:
         found = client.find_project(project)
         labeled = [path for path in files if has_actions(path)]
         plain = [path for path in files if path not in set(labeled)]
-        for batch in batches(plain, lambda path: path.stat().st_size, UPLOAD_FILES, UPLOAD_BYTES):
-            for receipt in client.add_files(found.id, {str(path): path.read_bytes() for path in batch}, split).items:
-                place = f"{receipt.split}, {receipt.transitions} transitions"
-                typer.echo(f"{receipt.source}: {receipt.status} {receipt.id} ({place})")
+        for receipt in add_plain(client, found.id, plain, split):
+            place = f"{receipt.split}, {receipt.transitions} transitions"
+            typer.echo(f"{receipt.source}: {receipt.status} {receipt.id} ({place})")
         for sent, accepted in add_labeled(client, found.id, labeled, split):
             told = f"{accepted.created} labels, {accepted.duplicates} known before"
-            typer.echo(f"{sent} labeled trajectories or parts of them: {told}")
+            typer.echo(f"{_from_to(sent)}: {len(sent)} labeled trajectories or parts of them: {told}")
+
+
+def _from_to(files: "Sequence[Path]") -> str:
+    return str(files[0]) if files[0] == files[-1] else f"{files[0]} to {files[-1]}"
 
 
 def _environment(simulator: str | None, options: list[str], spaces: Path | None) -> "Environment":

@@ -15,8 +15,8 @@ from service.errors import ForeignFile
 
 npy: Any = np.lib.format  # it has no types
 METADATA = "__metadata__"
-ENTRY = b"PK\x01\x02"  # opens each entry of an archive's directory
 MOST_MEMBERS = 66  # streams of an observation, and one of metadata
+LONGEST_DIRECTORY = 2**16 + 22  # bytes: what zipfile looks for its end in; an entry takes 46 and more, ours about 130
 LONGEST_HEADER = 1_000  # bytes; one of eight axes takes 200, and numpy takes 9 ms for a hostile one of 10,000
 HEADERS = {(1, 0): (2, npy.read_array_header_1_0), (2, 0): (4, npy.read_array_header_2_0)}  # width of the length
 BLOCK = 2**20
@@ -59,21 +59,19 @@ class NpzFile:
     def __init__(self, file: BinaryIO, source: str, max_bytes: int) -> None:
         """Raises ForeignFile for what is no npz of plain arrays, or would unpack to more than `max_bytes`."""
         self._file, self.source = file, source
-        with self._reading():
-            _check_members(file)
-            with zipfile.ZipFile(file) as archive:
-                members = archive.infolist()
-                self.bytes = sum(info.file_size for info in members)
-                if self.bytes > max_bytes:
-                    raise ForeignFile(source, f"unpacks to {self.bytes} bytes, {max_bytes} are allowed")
-                named = {info.filename.removesuffix(".npy"): _form(archive, info) for info in members}
-                if len(named) < len(members):
-                    raise ForeignFile(source, f"names a stream twice: {sorted(info.filename for info in members)}")
+        with self._reading(), _opened(file) as archive:
+            members = archive.infolist()
+            self.bytes = sum(info.file_size for info in members)
+            if self.bytes > max_bytes:
+                raise ForeignFile(source, f"unpacks to {self.bytes} bytes, {max_bytes} are allowed")
+            named = {info.filename.removesuffix(".npy"): _form(archive, info) for info in members}
+            if len(named) < len(members):
+                raise ForeignFile(source, f"names a stream twice: {sorted(info.filename for info in members)}")
         self.forms = {name: form for name, form in named.items() if name != METADATA}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All streams, read-only. Raises ForeignFile."""
-        with self._reading(), zipfile.ZipFile(self._file) as archive:
+        with self._reading(), _opened(self._file) as archive:
             return {name: _array(archive, form) for name, form in self.forms.items()}
 
     @contextmanager
@@ -86,15 +84,31 @@ class NpzFile:
             raise ForeignFile(self.source, f"is not a whole npz file of plain arrays ({error})") from error
 
 
-def _check_members(file: BinaryIO) -> None:
-    """Counts entries before zipfile makes an object of each. Raises ValueError."""
-    found, tail = 0, b""
-    file.seek(0)
-    while block := file.read(BLOCK):
-        found += (tail + block).count(ENTRY)
-        tail = block[1 - len(ENTRY) :]
-    if found > MOST_MEMBERS:
-        raise ValueError(f"{found} members, {MOST_MEMBERS} are allowed")
+class _Opening:
+    """A file of which no more than LONGEST_DIRECTORY is read at once until it `is_open`: zipfile reads the directory of
+    an archive whole, however long it says that it is, and makes an object of each entry."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.is_open = file, False
+        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+
+    def read(self, size: int = -1) -> bytes:
+        """Raises ValueError."""
+        if not self.is_open and size > LONGEST_DIRECTORY:
+            raise ValueError(f"a directory of {size} bytes, {LONGEST_DIRECTORY} are allowed")
+        return self._file.read(size)
+
+
+@contextmanager
+def _opened(file: BinaryIO) -> Iterator[zipfile.ZipFile]:
+    """The archive of few enough members. Raises ValueError."""
+    opening = _Opening(file)
+    with zipfile.ZipFile(opening) as archive:
+        opening.is_open = True
+        members = len(archive.infolist())
+        if members > MOST_MEMBERS:
+            raise ValueError(f"{members} members, {MOST_MEMBERS} are allowed")
+        yield archive
 
 
 def _form(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Form:
