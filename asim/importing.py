@@ -7,6 +7,7 @@ import zipfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import takewhile
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 from uuid import UUID
@@ -54,8 +55,9 @@ def add_plain(client: Client, project: UUID, paths: Sequence[Path], split: Split
     def send(batch: Sequence[Piece]) -> TrajectoriesAdded:
         return client.add_files(project, {str(piece.path): piece.path.read_bytes() for piece in batch}, split)
 
+    sending = _Sending(send, len(paths))
     cut = batches(map(Piece, paths), lambda piece: piece.path.stat().st_size, UPLOAD_FILES, UPLOAD_BYTES)
-    for _, added in _Sending(send, len(paths)).answers(cut):
+    for _, added in sending.answers(cut):
         yield from added.items
 
 
@@ -72,9 +74,10 @@ def add_labeled(
         brought = [piece.labeled for piece in batch if piece.labeled is not None]
         return client.label(LabelsRequest(project=project, source=source, trajectories=brought))
 
+    sending = _Sending(send, len(paths))
     read = (Piece(path, part) for path in paths for part in _parts(_labeled_trajectory(path, split), known))
-    cut = batches(read, lambda piece: _size(piece, known), BATCH_FILES, BATCH_BYTES)
-    for batch, accepted in _Sending(send, len(paths)).answers(cut):
+    cut = batches(sending.readable(read), lambda piece: _size(piece, known), BATCH_FILES, BATCH_BYTES)
+    for batch, accepted in sending.answers(cut):
         yield [piece.path for piece in batch], accepted
 
 
@@ -84,34 +87,30 @@ class _Sending(Generic[Answer]):
     def __init__(self, send: Callable[[Sequence[Piece]], Answer], files: int) -> None:
         self._send, self._files = send, files
         self._taken = set[Path]()
-        self._fault: AsimError | None = None
+        self._refused: AsimError | None = None
+        self._unreadable: AsimError | None = None
 
     def answers(self, cut: Iterable[Sequence[Piece]]) -> Iterator[tuple[Sequence[Piece], Answer]]:
-        """Each batch with its answer, in order. After a fault no other is sent; ImportStopped is raised once those on
-        their way are answered too."""
+        """Each batch with its answer, in order. After a refused one no other is sent; ImportStopped is raised once
+        those on their way are answered too."""
         with ThreadPoolExecutor(AHEAD) as threads:
             waiting = deque[tuple[Sequence[Piece], Future[Answer]]]()
-            for batch in self._until_fault(cut):
+            for batch in takewhile(lambda _: self._refused is None, cut):
                 waiting.append((batch, threads.submit(self._send, batch)))
                 if len(waiting) == AHEAD:
                     yield from self._answer(*waiting.popleft())
             for batch, sent in waiting:
                 yield from self._answer(batch, sent)
-        if self._fault is not None:
-            told = f"{self._fault}; {len(self._taken)} of {self._files} files are in"
-            raise ImportStopped(told) from self._fault
+        fault = self._refused or self._unreadable
+        if fault is not None:
+            raise ImportStopped(f"{fault}; {len(self._taken)} of {self._files} files are in") from fault
 
-    def _until_fault(self, cut: Iterable[Sequence[Piece]]) -> Iterator[Sequence[Piece]]:
-        left = iter(cut)
-        while self._fault is None:
-            try:
-                batch = next(left, None)
-            except AsimError as error:  # a file that cannot be read
-                self._fault = error
-                return
-            if batch is None:
-                return
-            yield batch
+    def readable(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
+        """Those before the first file that cannot be read."""
+        try:
+            yield from pieces
+        except AsimError as error:
+            self._unreadable = error
 
     def _answer(self, batch: Sequence[Piece], sent: "Future[Answer]") -> Iterator[tuple[Sequence[Piece], Answer]]:
         try:
@@ -119,17 +118,17 @@ class _Sending(Generic[Answer]):
         except (Invalid, Conflict):
             yield from self._one_by_one(batch)
         except AsimError as error:
-            self._fault = self._fault or error
+            self._refused = self._refused or error
         else:
             yield self._accepted(batch, answer)
 
     def _one_by_one(self, batch: Sequence[Piece]) -> Iterator[tuple[Sequence[Piece], Answer]]:
         """Up to the one at fault: the service names what was refused by its place in the request, or by its content."""
-        for piece in batch if self._fault is None else ():
+        for piece in batch if self._refused is None else ():
             try:
                 answer = self._send([piece])
             except AsimError as error:
-                self._fault = _naming(piece.path, error)
+                self._refused = _naming(piece.path, error)
                 return
             yield self._accepted([piece], answer)
 
