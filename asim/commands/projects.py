@@ -1,4 +1,4 @@
-"""asim project, asim collect, asim import: what is known of an environment, and its trajectories."""
+"""asim project, asim collect: what is known of an environment, and trajectories from its simulator."""
 
 import json
 from pathlib import Path
@@ -10,8 +10,6 @@ from asim.commands.console import DEFAULT_URL, Key, ProjectName, Split, Strategy
 from asim.errors import AsimError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from api_schemas.environments import Environment
 
 app = typer.Typer(no_args_is_help=True)
@@ -131,36 +129,6 @@ def collect(
         job = client.collect(collection)
         done = client.wait_for_job(job.id, progress=lambda seen: advance(seen.progress, seen.message))
     typer.echo(json.dumps(done.result))
-
-
-def import_files(
-    project: ProjectName,
-    files: Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="npz files, one a trajectory.")],
-    split: Split = "auto",
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-) -> None:
-    """Add recorded trajectories.
-
-    An npz file holds one array for each observation stream of the project, time first, T + 1 rows. With a further
-    array `actions` of T rows it is a labeled trajectory: all its segments are labeled at once.
-    """
-    from asim.importing import add_labeled, add_plain, has_actions
-
-    with connect(url, key) as client:
-        found = client.find_project(project)
-        labeled = [path for path in files if has_actions(path)]
-        plain = [path for path in files if path not in set(labeled)]
-        for receipt in add_plain(client, found.id, plain, split):
-            place = f"{receipt.split}, {receipt.transitions} transitions"
-            typer.echo(f"{receipt.source}: {receipt.status} {receipt.id} ({place})")
-        for sent, accepted in add_labeled(client, found.id, labeled, split):
-            told = f"{accepted.created} labels, {accepted.duplicates} known before"
-            typer.echo(f"{_from_to(sent)}: {len(sent)} labeled trajectories or parts of them: {told}")
-
-
-def _from_to(files: "Sequence[Path]") -> str:
-    return str(files[0]) if files[0] == files[-1] else f"{files[0]} to {files[-1]}"
 
 
 def _environment(simulator: str | None, options: list[str], spaces: Path | None) -> "Environment":

@@ -27,7 +27,7 @@ from asim.client import Client
 from asim.importing import add_plain
 from asim.served import served
 from benchmarks.figures import Figure, finish
-from benchmarks.service.recordings import OPTIONS, SIMULATOR, Recordings, Written
+from benchmarks.service.recordings import SIMULATOR, TASK, Recordings, Written
 
 TRAJECTORIES, CHUNK, MINUTES = 5000, 100, 10.0
 SHARE = 0.8  # of the codec's speed
@@ -122,7 +122,7 @@ def _imported(client: Client, project: UUID, written: Written, service: Process)
 
 
 def _project() -> ProjectCreate:
-    environment = Environment(simulator=SIMULATOR, options=OPTIONS)
+    environment = Environment(simulator=SIMULATOR, options={"task": TASK})
     return ProjectCreate(name="bench", environment=environment, policy=LabelingPolicy(round_labels=0))
 
 

@@ -17,7 +17,7 @@ from service.store import codec
 from workers.simulators.catalog import make_behavior, make_simulator
 
 EPISODES, STEPS = 8, 100
-SIMULATOR, OPTIONS, BEHAVIOR = "maniskill", {"task": "PokeCube"}, "noisy_expert"
+SIMULATOR, TASK, BEHAVIOR = "maniskill", "PokeCube", "noisy_expert"
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -64,7 +64,7 @@ class Recordings:
 
 def _rendered() -> Iterator[Arrays]:
     """Episodes that go on where the task is solved, so that all are of one length."""
-    with closing(make_simulator(SIMULATOR, OPTIONS)) as simulator:
+    with closing(make_simulator(SIMULATOR, {"task": TASK})) as simulator:
         behavior = make_behavior(BEHAVIOR, simulator)
         for seed in range(EPISODES):
             rng, seen = np.random.default_rng(seed), [simulator.reset(seed)]
