@@ -17,6 +17,7 @@ export async function askStrip(project, events, signal) {
   if (!pool_trajectories && !held_out_trajectories) return null;
   if (known && Date.now() - known.asked < KEPT_MS) return known;
   const trajectory = await newest(project.id, events, known, signal);
+  if (!trajectory) return null;
   const strip = trajectory === known?.trajectory ? known : await stripOf(project.id, trajectory, signal);
   strips.set(project.id, { ...strip, asked: Date.now() });
   return strips.get(project.id);
