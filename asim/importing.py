@@ -7,6 +7,7 @@ import zipfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from itertools import takewhile
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
@@ -53,7 +54,9 @@ def add_plain(client: Client, project: UUID, paths: Sequence[Path], split: Split
     """Upload the files as trajectories: a receipt each, in order. Raises ImportStopped."""
 
     def send(batch: Sequence[Piece]) -> TrajectoriesAdded:
-        return client.add_files(project, {str(piece.path): piece.path.read_bytes() for piece in batch}, split)
+        with ExitStack() as stack:
+            files = {str(piece.path): stack.enter_context(piece.path.open("rb")) for piece in batch}
+            return client.add_files(project, files, split)
 
     sending = _Sending(send, len(paths))
     cut = batches(map(Piece, paths), lambda piece: piece.path.stat().st_size, UPLOAD_FILES, UPLOAD_BYTES)

@@ -144,12 +144,13 @@ def _figures(turns: list[Turn]) -> list[Figure]:
         print(f"memory at {name}: client {client:.0f} MiB, service {service:.0f} MiB")
     growth = [turns[-1].memory[which] - turns[len(turns) // 4].memory[which] for which in (0, 1)]
     spent = [1e3 * sum(turn.processor[which] for turn in turns) / files for which in (0, 1)]
+    unit = "ms of processor time a trajectory"
     return [
         Figure("codec", statistics.median(codec), "MiB/s"),
         Figure("import", statistics.median(rates), "MiB/s"),
-        Figure("codec_cost", 1e3 * sum(turn.written.seconds for turn in turns) / files, "ms a trajectory"),
-        Figure("client_cost", spent[0], "ms of processor time a trajectory"),
-        Figure("service_cost", spent[1], "ms of processor time a trajectory"),
+        Figure("codec_cost", 1e3 * sum(turn.written.processor for turn in turns) / files, unit),
+        Figure("client_cost", spent[0], unit),
+        Figure("service_cost", spent[1], unit),
         Figure("client_memory_growth", growth[0], "MiB from a quarter to the end", GROWTH, "below"),
         Figure("service_memory_growth", growth[1], "MiB from a quarter to the end", GROWTH, "below"),
         Figure("import_to_codec", statistics.median(rates) / statistics.median(codec), "ratio", SHARE),

@@ -22,10 +22,12 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class Written(NamedTuple):
-    """Files of a folder, and what the store's codec made of the same arrays: seconds, its bytes and theirs."""
+    """Files of a folder, and what the store's codec made of the same arrays: seconds by the clock and of processor
+    time, its bytes and theirs."""
 
     files: list[Path]
     seconds: float
+    processor: float
     encoded: int
     bytes: int
 
@@ -49,17 +51,17 @@ class Recordings:
 
     def write(self, folder: Path, first: int, count: int) -> Written:
         """As npz files, the codec's work on them measured: their name by content, and their bytes in the store."""
-        files, seconds, encoded, size = [], 0.0, 0, 0
+        files, seconds, processor, encoded, size = [], 0.0, 0.0, 0, 0
         for number in range(first, first + count):
             arrays = self.trajectory(number)
             files.append(folder / f"{number}.npz")
             np.savez(files[-1], **arrays)
-            began = time.perf_counter()
+            began, worked = time.perf_counter(), time.process_time()
             codec.content_id(arrays)
             encoded += len(codec.encode(arrays))
-            seconds += time.perf_counter() - began
+            seconds, processor = seconds + time.perf_counter() - began, processor + time.process_time() - worked
             size += sum(stream.nbytes for stream in arrays.values())
-        return Written(files, seconds, encoded, size)
+        return Written(files, seconds, processor, encoded, size)
 
 
 def _rendered() -> Iterator[Arrays]:
