@@ -5,8 +5,9 @@
 
 Two cameras of 64 x 64 and proprioception, 100 transitions, pictures of a simulator (see `recordings`). The files are
 written by a process of their own, which also times the codec; this one imports them as `asim import` does, into an
-`asim serve` of its own, and holds nothing else. Both take turns, CHUNK files each. Rates are medians over the turns, of
-wall time: the codec has one processor, client and service have what there is.
+`asim serve` of its own, and holds nothing else. Both take turns, CHUNK files each; the ratio is the median over the
+turns, by the clock: the codec has one processor, client and service have what there is. What the codec does to a
+trajectory is its name by content and its bytes in the store.
 """
 
 import argparse
@@ -18,6 +19,8 @@ import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cache
+from operator import truediv
 from pathlib import Path
 from uuid import UUID
 
@@ -31,7 +34,6 @@ from benchmarks.service.recordings import SIMULATOR, TASK, Recordings, Written
 
 TRAJECTORIES, CHUNK, MINUTES = 5000, 100, 10.0
 SHARE = 0.8  # of the codec's speed
-_recordings: Recordings
 GROWTH = 32.0  # MiB from the first quarter to the end, of either process
 MEBIBYTE = 2**20
 
@@ -79,7 +81,7 @@ def measure(trajectories: int, minutes: float) -> list[Turn]:
     spawn, turns = multiprocessing.get_context("spawn"), list[Turn]()
     deadline = time.monotonic() + 60 * minutes
     with (
-        ProcessPoolExecutor(1, spawn, initializer=render) as writer,
+        ProcessPoolExecutor(1, spawn) as writer,
         tempfile.TemporaryDirectory() as folder,
         served(Path(folder)) as url,
         Client(url) as client,
@@ -97,15 +99,15 @@ def measure(trajectories: int, minutes: float) -> list[Turn]:
     return turns
 
 
-def render() -> None:
-    """Once, in the process that writes."""
-    global _recordings  # noqa: PLW0603  (a process of a pool keeps what its initializer made)
-    _recordings = Recordings()
+@cache
+def recordings() -> Recordings:
+    """Rendered once in a process."""
+    return Recordings()
 
 
 def write(folder: Path, first: int, count: int) -> Written:
-    """In that process."""
-    return _recordings.write(folder, first, count)
+    """In the process that writes."""
+    return recordings().write(folder, first, count)
 
 
 def _imported(client: Client, project: UUID, written: Written, service: Process) -> Turn:
@@ -131,16 +133,10 @@ def _figures(turns: list[Turn]) -> list[Figure]:
     rates = [turn.written.bytes / turn.seconds / MEBIBYTE for turn in turns]
     codec = [turn.written.bytes / turn.written.seconds / MEBIBYTE for turn in turns]
     packed = size / sum(turn.written.encoded for turn in turns)
-    print(
-        f"{files} trajectories of two cameras, {size / files / MEBIBYTE:.2f} MiB each, stored at 1/{packed:.1f} of it"
-    )
-    for place, name in (
-        (0, "start"),
-        (len(turns) // 4, "a quarter"),
-        (len(turns) // 2, "half"),
-        (len(turns) - 1, "end"),
-    ):
-        client, service = turns[place].memory
+    each = f"{size / files / MEBIBYTE:.2f} MiB each, stored at 1/{packed:.1f} of it"
+    print(f"{files} trajectories of two cameras, {each}")
+    for name, place in zip(("start", "a quarter", "half", "end"), (0, 1, 2, 4), strict=True):
+        client, service = turns[min(place * len(turns) // 4, len(turns) - 1)].memory
         print(f"memory at {name}: client {client:.0f} MiB, service {service:.0f} MiB")
     growth = [turns[-1].memory[which] - turns[len(turns) // 4].memory[which] for which in (0, 1)]
     spent = [1e3 * sum(turn.processor[which] for turn in turns) / files for which in (0, 1)]
@@ -153,7 +149,7 @@ def _figures(turns: list[Turn]) -> list[Figure]:
         Figure("service_cost", spent[1], unit),
         Figure("client_memory_growth", growth[0], "MiB from a quarter to the end", GROWTH, "below"),
         Figure("service_memory_growth", growth[1], "MiB from a quarter to the end", GROWTH, "below"),
-        Figure("import_to_codec", statistics.median(rates) / statistics.median(codec), "ratio", SHARE),
+        Figure("import_to_codec", statistics.median(map(truediv, rates, codec)), "ratio", SHARE),
     ]
 
 
