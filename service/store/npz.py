@@ -2,7 +2,10 @@
 
 import io
 import math
+import mmap
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +23,7 @@ LONGEST_DIRECTORY = 2**16 + 22  # bytes: what zipfile looks for its end in; an e
 LONGEST_HEADER = 1_000  # bytes; one of eight axes takes 200, and numpy takes 9 ms for a hostile one of 10,000
 HEADERS = {(1, 0): (2, npy.read_array_header_1_0), (2, 0): (4, npy.read_array_header_2_0)}  # width of the length
 BLOCK = 2**20
+LONG = 2**20  # bytes: from here on a file of an upload is on the disk
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy writes; zipfile bounds the output of no other
 
 
@@ -72,7 +76,8 @@ class NpzFile:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All streams, read-only. Raises ForeignFile."""
         with self._reading(), _opened(self._file) as archive:
-            return {name: _array(archive, form) for name, form in self.forms.items()}
+            held = _held(self._file)
+            return {name: _array(archive, held, form) for name, form in self.forms.items()}
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -132,16 +137,44 @@ def _form(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Form:
     return Form(info, shape, dtype, fortran, offset)
 
 
-def _array(archive: zipfile.ZipFile, form: Form) -> NDArray[Any]:
+def _held(file: BinaryIO) -> memoryview:
+    """The file's bytes where they are: fresh memory for a copy of a long one costs more than all of its checks."""
+    if isinstance(file, io.BytesIO):
+        return file.getbuffer()
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    return memoryview(file.read() if size < LONG else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+def _array(archive: zipfile.ZipFile, held: memoryview, form: Form) -> NDArray[Any]:
     """The data of one member. Raises ValueError."""
-    size, held = form.member.file_size, 0
-    content = bytearray(size)  # filled block by block: zlib would hold the whole twice
-    with archive.open(form.member) as member:
-        while block := member.read(min(BLOCK, size - held)):  # bounded: a lying member may hold more than its size
-            content[held : held + len(block)] = block
-            held += len(block)
-    if held != size:
-        raise ValueError(f"{form.member.filename} promises {size} bytes and holds {held}")
+    is_stored = form.member.compress_type == zipfile.ZIP_STORED
+    content = _stored(held, form.member) if is_stored else _inflated(archive, form.member)
     array: NDArray[Any] = np.ndarray(form.shape, form.dtype, content, form.offset, order="F" if form.fortran else "C")
+    array = array if array.flags.aligned else array.copy("K")
     array.flags.writeable = False
     return array
+
+
+def _stored(held: memoryview, member: zipfile.ZipInfo) -> memoryview:
+    """A member that lies in the file as it is, behind a header of its own. Raises ValueError."""
+    name, extra = struct.unpack_from("<HH", held, member.header_offset + 26)
+    first = member.header_offset + 30 + name + extra
+    content = held[first : first + member.compress_size]
+    if len(content) != member.file_size or zlib.crc32(content) != member.CRC:
+        raise ValueError(f"{member.filename} promises {member.file_size} bytes and holds others")
+    return content
+
+
+def _inflated(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytearray:
+    """A member that zlib unpacks; zipfile compares its checksum. Raises ValueError."""
+    content, held = bytearray(member.file_size), 0  # filled block by block: zlib would hold the whole twice
+    with archive.open(member) as file:
+        while block := file.read(
+            min(BLOCK, len(content) - held)
+        ):  # bounded: a lying member may hold more than its size
+            content[held : held + len(block)] = block
+            held += len(block)
+    if held != len(content):
+        raise ValueError(f"{member.filename} promises {len(content)} bytes and holds {held}")
+    return content
