@@ -49,9 +49,9 @@ test-slow: setup ## the long tests: kills at random moments, scale (REPEAT=5 sho
 	scripts/system-packages all
 	REPEAT=$(REPEAT) $(BIN)/python -m pytest -m slow
 
-audit: setup ## known vulnerabilities of everything installed (asks PyPI; says so and fails where it cannot)
+audit: setup-robots ## known vulnerabilities of everything installed (asks PyPI; says so and fails where it cannot)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[audit]'
-	$(BIN)/pip-audit --strict --skip-editable --progress-spinner off
+	$(BIN)/python scripts/audit.py
 
 test-robots: setup-robots ## the long tests of the robot simulators: whole episodes replayed
 	$(BIN)/python -m pytest -m robots
