@@ -8,7 +8,8 @@ REPEAT ?= 50
 JOBS ?= 2
 
 .PHONY: help setup setup-robots system demo serve test test-slow test-robots audit lint types imports format bench-acquire \
-	bench-score bench-simulators bench-labels bench-policies bench-paper-minigrid bench-paper-minigrid-full clean
+	bench-score bench-import bench-simulators bench-labels bench-robot-projects bench-policies bench-paper-minigrid \
+	bench-paper-minigrid-full clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -76,6 +77,9 @@ bench-acquire: setup ## latency of POST /acquire with a ready queue
 bench-score: setup ## the scoring job beside the networks' bare forward pass
 	$(BIN)/python -m benchmarks.service.score
 
+bench-import: setup-robots ## import of image trajectories beside the store's own codec, and memory over 5,000 of them
+	$(BIN)/python -m benchmarks.service.imports
+
 bench-simulators: setup-robots ## steps a second of every robot task, and a picture of an episode of each
 	$(BIN)/python -m benchmarks.simulators
 
@@ -84,6 +88,9 @@ bench-labels: setup-robots ## labels of robot tasks by replay and by search: rig
 
 bench-policies: setup-robots ## diffusion policies of Lift and PullCube: success over their stages, time of training
 	$(BIN)/python -m benchmarks.simulators.policies
+
+bench-robot-projects: setup-robots ## every robot task through the service: collected, acquired, labeled, compared (an hour)
+	$(BIN)/python -m benchmarks.simulators.projects
 
 bench-paper-minigrid: setup ## the paper's MiniGrid figures, resumable (QUICK=1: 4a and 4d with four arms)
 	$(BIN)/python -m benchmarks.paper.minigrid $(if $(QUICK),--quick)

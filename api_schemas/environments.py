@@ -110,6 +110,15 @@ class MiniGridOptions(Schema):
         return self
 
 
+SMALLEST_PICTURE = 16  # pixels a side: what is smaller shows nothing to a person, such as a grid's code
+
+
+def is_picture(stream: Stream) -> bool:
+    """Whether people can look at it: (H, W, 3) bytes that may have any value."""
+    is_rgb = stream.dtype == "uint8" and len(stream.shape) == 3 and stream.shape[2] == 3
+    return is_rgb and min(stream.shape[:2]) >= SMALLEST_PICTURE and stream.high is None
+
+
 GRID_HIGH = (10, 5, 4)  # the last object, colour and state that the grid family knows
 
 

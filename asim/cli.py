@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from asim.commands import keys, labeling, policies, processes, projects, upkeep, work
+from asim.commands import keys, labeling, policies, processes, projects, recordings, upkeep, work
 from asim.commands.console import explain
 
 app = typer.Typer(
@@ -22,7 +22,8 @@ app.add_typer(projects.app, name="project", help="Create, list, show and change 
 app.add_typer(keys.app, name="key", help="Make, list and revoke API keys, on the service's own database.")
 app.add_typer(policies.app, name="policy", help="Train policies of robot tasks, and list them.")
 app.command("collect")(projects.collect)
-app.command("import")(projects.import_files)
+app.command("import")(recordings.import_files)
+app.command("export")(recordings.export_pictures)
 app.command("acquire")(labeling.acquire)
 app.command("label")(labeling.label)
 app.command("round")(labeling.start_round)

@@ -3,6 +3,7 @@
 import random
 import time
 from collections.abc import Callable, Collection, Mapping
+from typing import BinaryIO
 
 import httpx
 from pydantic import BaseModel, ValidationError
@@ -15,7 +16,7 @@ LONGEST_PAUSE = 10.0  # seconds
 IDEMPOTENCY_KEY = "Idempotency-Key"  # what is sent again under the same one is done once
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 Params = Mapping[str, object]
-Upload = tuple[str, tuple[str, bytes, str]]
+Upload = tuple[str, tuple[str, bytes | BinaryIO, str]]
 
 
 class Transport:

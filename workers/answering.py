@@ -78,12 +78,13 @@ def _explainer(client: Client, project: Project, simulator: Simulator, behaviors
     def known() -> Iterator[Known]:
         for label in islice(client.labels(project.id), KNOWN):
             with suppress(NotFound):  # of the states of recordings that came from elsewhere
-                yield Known(_recording(client, project, label.trajectory, label.start), label.actions)
+                yield Known(recording_of(client, project, label.trajectory, label.start), label.actions)
 
     return explainer_of(simulator, provenance, known, behaviors)
 
 
-def _recording(client: Client, project: Project, trajectory: str, start: int) -> Recording:
+def recording_of(client: Client, project: Project, trajectory: str, start: int) -> Recording:
+    """A segment with the states that it was recorded in. Raises NotFound where none are kept."""
     content = client.trajectory_content(project.id, trajectory, start, project.segment_length)
     states, _ = client.provenance(project.id, trajectory, start, project.segment_length)
     return Recording(trajectory, start, content, states)
@@ -92,7 +93,7 @@ def _recording(client: Client, project: Project, trajectory: str, start: int) ->
 def _label(
     client: Client, project: Project, explainer: Explainer, item: AcquisitionItem, generator: np.random.Generator
 ) -> LabelItem:
-    recording = _recording(client, project, item.trajectory, item.start)
+    recording = recording_of(client, project, item.trajectory, item.start)
     sets, worst = list[list[Action]](), 0.0
     for step in range(item.length):
         found = explainer.explain(recording, step)

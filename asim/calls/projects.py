@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +53,10 @@ class ProjectCalls(Calls):
         """POST /trajectories: by file name, arrays by stream name, time first, T + 1 rows."""
         return self.add_files(project, {name: pack(arrays) for name, arrays in files.items()}, split)
 
-    def add_files(self, project: Id, files: Mapping[str, bytes], split: SplitChoice = "auto") -> TrajectoriesAdded:
-        """POST /trajectories with npz files as they are."""
+    def add_files(
+        self, project: Id, files: Mapping[str, bytes | BinaryIO], split: SplitChoice = "auto"
+    ) -> TrajectoriesAdded:
+        """POST /trajectories with npz files as they are; open ones are read while they are sent."""
         uploads = [("files", (name, content, "application/octet-stream")) for name, content in files.items()]
         params = {"project": project, "split": split}
         answer = self._transport.request("POST", "/trajectories", params=params, files=uploads)

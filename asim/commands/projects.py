@@ -1,4 +1,4 @@
-"""asim project, asim collect, asim import: what is known of an environment, and its trajectories."""
+"""asim project, asim collect: what is known of an environment, and trajectories from its simulator."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from api_schemas.collections import CollectionLabels
     from api_schemas.environments import Environment
 
-UPLOAD_FILES, UPLOAD_BYTES = 200, 32 * 2**20  # of one request, so that no upload meets the service's limit
 app = typer.Typer(no_args_is_help=True)
 RoundLabels = Annotated[int | None, typer.Option(min=0, help="New pool labels that start a round; 0: none does.")]
 LabelBudget = Annotated[int | None, typer.Option(min=1, help="Pool labels that may be spent in all.")]
@@ -137,34 +136,6 @@ def collect(
         )
         done = await_collection(client, client.collect(collection), advance)
     typer.echo(json.dumps(done))
-
-
-def import_files(
-    project: ProjectName,
-    files: Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="npz files, one a trajectory.")],
-    split: Split = "auto",
-    url: Url = DEFAULT_URL,
-    key: Key = None,
-) -> None:
-    """Add recorded trajectories.
-
-    An npz file holds one array for each observation stream of the project, time first, T + 1 rows. With a further
-    array `actions` of T rows it is a labeled trajectory: all its segments are labeled at once.
-    """
-    from asim.batches import batches
-    from asim.importing import add_labeled, has_actions
-
-    with connect(url, key) as client:
-        found = client.find_project(project)
-        labeled = [path for path in files if has_actions(path)]
-        plain = [path for path in files if path not in set(labeled)]
-        for batch in batches(plain, lambda path: path.stat().st_size, UPLOAD_FILES, UPLOAD_BYTES):
-            for receipt in client.add_files(found.id, {str(path): path.read_bytes() for path in batch}, split).items:
-                place = f"{receipt.split}, {receipt.transitions} transitions"
-                typer.echo(f"{receipt.source}: {receipt.status} {receipt.id} ({place})")
-        for sent, accepted in add_labeled(client, found.id, labeled, split):
-            told = f"{accepted.created} labels, {accepted.duplicates} known before"
-            typer.echo(f"{sent} labeled trajectories or parts of them: {told}")
 
 
 def _labels(per_action: int | None, segments: str | None) -> "CollectionLabels | None":

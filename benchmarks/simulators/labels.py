@@ -9,7 +9,7 @@ worker. A search begins at a guess fitted on KNOWN other labels. Status 1 where 
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from typing import NamedTuple, cast
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import Figure, finish
 from benchmarks.simulators.speed import TASKS, Task
 from workers.episodes import Episode, new_episodes
-from workers.explainers import ReplayOrSearch, explainer_of
+from workers.explainers import Explained, ReplayOrSearch, explainer_of
 from workers.recording import Known, Provenance, Recording
 from workers.simulators.base import Simulator
 from workers.simulators.catalog import make_behavior, make_simulator
@@ -76,28 +76,32 @@ def measure(task: Task, segments: int) -> list[Figure]:
     with closing(make_simulator(task.simulator, {"task": task.name, "cameras": False})) as simulator:
         data = Data(simulator, segments)
         explainer = cast(ReplayOrSearch, explainer_of(simulator, data.provenance, data.known))
-        replayed, searched = label(explainer, data, by_search=False), label(explainer, data, by_search=True)
+        replayed, searched = (label(way, data.recordings()) for way in (explainer.explain, explainer.search))
     true = data.true_actions()
-    equal = int(((replayed.actions == true).all(axis=1) & (replayed.residuals == 0)).sum())
-    return [
-        Figure(f"{task.name}_replay_equal", equal, f"of {segments} labels are the actions taken", segments),
-        Figure(f"{task.name}_replay_cost", 1e3 * replayed.seconds, "ms a label"),
-        *_searched(task.name, searched, true),
-    ]
+    return [*replay_figures(task.name, replayed, true), *search_figures(task.name, searched, true)]
 
 
-def label(explainer: ReplayOrSearch, data: Data, *, by_search: bool) -> Labels:
-    """The worker's labels of all segments."""
-    explain = explainer.search if by_search else explainer.explain
+def label(explain: Callable[[Recording, int], Explained], recordings: Iterable[Recording]) -> Labels:
+    """The worker's labels of recordings of one step."""
     actions, residuals, began = [], [], time.process_time()
-    for recording in data.recordings():
+    for recording in recordings:
         found = explain(recording, 0)
         actions.append(found.actions[0] if found.actions else [np.nan] * 7)
         residuals.append(found.residual)
     return Labels(np.array(actions), np.array(residuals), (time.process_time() - began) / len(actions))
 
 
-def _searched(name: str, labels: Labels, true: NDArray[np.float64]) -> list[Figure]:
+def replay_figures(name: str, labels: Labels, true: NDArray[np.float64]) -> list[Figure]:
+    """How many labels are the actions taken, to the last bit and with residual 0, and what one costs."""
+    equal = int(((labels.actions == true).all(axis=1) & (labels.residuals == 0)).sum())
+    return [
+        Figure(f"{name}_replay_equal", equal, f"of {len(true)} labels are the actions taken", len(true)),
+        Figure(f"{name}_replay_cost", 1e3 * labels.seconds, "ms a label"),
+    ]
+
+
+def search_figures(name: str, labels: Labels, true: NDArray[np.float64]) -> list[Figure]:
+    """How many were found, how far they are off, and what one costs."""
     found = ~np.isnan(labels.actions[:, 0])
     off = np.abs(labels.actions[found] - true[found])
     signs = float(np.mean(np.sign(labels.actions[found, 6]) == np.sign(true[found, 6])))

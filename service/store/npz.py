@@ -2,7 +2,10 @@
 
 import io
 import math
+import mmap
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,11 +18,12 @@ from service.errors import ForeignFile
 
 npy: Any = np.lib.format  # it has no types
 METADATA = "__metadata__"
-ENTRY = b"PK\x01\x02"  # opens each entry of an archive's directory
 MOST_MEMBERS = 66  # streams of an observation, and one of metadata
+LONGEST_DIRECTORY = 2**16 + 22  # bytes: what zipfile looks for its end in; an entry takes 46 and more, ours about 130
 LONGEST_HEADER = 1_000  # bytes; one of eight axes takes 200, and numpy takes 9 ms for a hostile one of 10,000
 HEADERS = {(1, 0): (2, npy.read_array_header_1_0), (2, 0): (4, npy.read_array_header_2_0)}  # width of the length
 BLOCK = 2**20
+LONG = 2**20  # bytes: from here on a file of an upload is on the disk
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy writes; zipfile bounds the output of no other
 
 
@@ -59,22 +63,21 @@ class NpzFile:
     def __init__(self, file: BinaryIO, source: str, max_bytes: int) -> None:
         """Raises ForeignFile for what is no npz of plain arrays, or would unpack to more than `max_bytes`."""
         self._file, self.source = file, source
-        with self._reading():
-            _check_members(file)
-            with zipfile.ZipFile(file) as archive:
-                members = archive.infolist()
-                self.bytes = sum(info.file_size for info in members)
-                if self.bytes > max_bytes:
-                    raise ForeignFile(source, f"unpacks to {self.bytes} bytes, {max_bytes} are allowed")
-                named = {info.filename.removesuffix(".npy"): _form(archive, info) for info in members}
-                if len(named) < len(members):
-                    raise ForeignFile(source, f"names a stream twice: {sorted(info.filename for info in members)}")
+        with self._reading(), _opened(file) as archive:
+            members = archive.infolist()
+            self.bytes = sum(info.file_size for info in members)
+            if self.bytes > max_bytes:
+                raise ForeignFile(source, f"unpacks to {self.bytes} bytes, {max_bytes} are allowed")
+            named = {info.filename.removesuffix(".npy"): _form(archive, info) for info in members}
+            if len(named) < len(members):
+                raise ForeignFile(source, f"names a stream twice: {sorted(info.filename for info in members)}")
         self.forms = {name: form for name, form in named.items() if name != METADATA}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All streams, read-only. Raises ForeignFile."""
-        with self._reading(), zipfile.ZipFile(self._file) as archive:
-            return {name: _array(archive, form) for name, form in self.forms.items()}
+        with self._reading(), _opened(self._file) as archive:
+            held = _held(self._file)
+            return {name: _array(archive, held, form) for name, form in self.forms.items()}
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -86,15 +89,31 @@ class NpzFile:
             raise ForeignFile(self.source, f"is not a whole npz file of plain arrays ({error})") from error
 
 
-def _check_members(file: BinaryIO) -> None:
-    """Counts entries before zipfile makes an object of each. Raises ValueError."""
-    found, tail = 0, b""
-    file.seek(0)
-    while block := file.read(BLOCK):
-        found += (tail + block).count(ENTRY)
-        tail = block[1 - len(ENTRY) :]
-    if found > MOST_MEMBERS:
-        raise ValueError(f"{found} members, {MOST_MEMBERS} are allowed")
+class _Opening:
+    """A file of which no more than LONGEST_DIRECTORY is read at once until it `is_open`: zipfile reads the directory of
+    an archive whole, however long it says that it is, and makes an object of each entry."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.is_open = file, False
+        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+
+    def read(self, size: int = -1) -> bytes:
+        """Raises ValueError."""
+        if not self.is_open and size > LONGEST_DIRECTORY:
+            raise ValueError(f"a directory of {size} bytes, {LONGEST_DIRECTORY} are allowed")
+        return self._file.read(size)
+
+
+@contextmanager
+def _opened(file: BinaryIO) -> Iterator[zipfile.ZipFile]:
+    """The archive of few enough members. Raises ValueError."""
+    opening = _Opening(file)
+    with zipfile.ZipFile(opening) as archive:
+        opening.is_open = True
+        members = len(archive.infolist())
+        if members > MOST_MEMBERS:
+            raise ValueError(f"{members} members, {MOST_MEMBERS} are allowed")
+        yield archive
 
 
 def _form(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Form:
@@ -118,16 +137,44 @@ def _form(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Form:
     return Form(info, shape, dtype, fortran, offset)
 
 
-def _array(archive: zipfile.ZipFile, form: Form) -> NDArray[Any]:
+def _held(file: BinaryIO) -> memoryview:
+    """The file's bytes where they are: fresh memory for a copy of a long one costs more than all of its checks."""
+    if isinstance(file, io.BytesIO):
+        return file.getbuffer()
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    return memoryview(file.read() if size < LONG else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+def _array(archive: zipfile.ZipFile, held: memoryview, form: Form) -> NDArray[Any]:
     """The data of one member. Raises ValueError."""
-    size, held = form.member.file_size, 0
-    content = bytearray(size)  # filled block by block: zlib would hold the whole twice
-    with archive.open(form.member) as member:
-        while block := member.read(min(BLOCK, size - held)):  # bounded: a lying member may hold more than its size
-            content[held : held + len(block)] = block
-            held += len(block)
-    if held != size:
-        raise ValueError(f"{form.member.filename} promises {size} bytes and holds {held}")
+    is_stored = form.member.compress_type == zipfile.ZIP_STORED
+    content = _stored(held, form.member) if is_stored else _inflated(archive, form.member)
     array: NDArray[Any] = np.ndarray(form.shape, form.dtype, content, form.offset, order="F" if form.fortran else "C")
+    array = array if array.flags.aligned else array.copy("K")
     array.flags.writeable = False
     return array
+
+
+def _stored(held: memoryview, member: zipfile.ZipInfo) -> memoryview:
+    """A member that lies in the file as it is, behind a header of its own. Raises ValueError."""
+    name, extra = struct.unpack_from("<HH", held, member.header_offset + 26)
+    first = member.header_offset + 30 + name + extra
+    content = held[first : first + member.compress_size]
+    if len(content) != member.file_size or zlib.crc32(content) != member.CRC:
+        raise ValueError(f"{member.filename} promises {member.file_size} bytes and holds others")
+    return content
+
+
+def _inflated(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytearray:
+    """A member that zlib unpacks; zipfile compares its checksum. Raises ValueError."""
+    content, held = bytearray(member.file_size), 0  # filled block by block: zlib would hold the whole twice
+    with archive.open(member) as file:
+        while block := file.read(
+            min(BLOCK, len(content) - held)
+        ):  # bounded: a lying member may hold more than its size
+            content[held : held + len(block)] = block
+            held += len(block)
+    if held != len(content):
+        raise ValueError(f"{member.filename} promises {len(content)} bytes and holds {held}")
+    return content

@@ -3,6 +3,7 @@
 There need be no Docker engine: commands, variables and secrets are the file's, paths and hosts are mapped.
 """
 
+import re
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import yaml
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "docker-compose.yml"
 SCRIPT = ROOT / "docker" / "make-secrets"
+DOCKERFILE = ROOT / "docker" / "Dockerfile"
 OURS = ("service", "scheduler", "trainer", "scorer", "labeler")
 SECRETS = "/run/secrets"
 MOUNTS = ("/data", "/blobs", "/provenance", SECRETS)
@@ -34,6 +36,17 @@ def service(name: str) -> Json:
     """One service of it."""
     found: Json = compose()["services"][name]
     return found
+
+
+@cache
+def stages() -> dict[str, str]:
+    """The stages of the Dockerfile by name, each with those that it is made from before it."""
+    made = dict[str, str]()
+    for stage in re.split(r"^FROM ", DOCKERFILE.read_text(), flags=re.MULTILINE)[1:]:
+        source, _, name = stage.partition("\n")[0].partition(" AS ")
+        copied = "".join(made.get(each, "") for each in re.findall(r"--from=(\S+)", stage))
+        made[name] = made.get(source, "") + copied + stage
+    return made
 
 
 def make_secrets(folder: Path) -> dict[str, str]:

@@ -13,7 +13,18 @@ from sqlalchemy import make_url
 
 from asim.client import Client
 from service.store.provenance import ProvenanceBlobs
-from tests.compose.compose_file import FILE, OURS, ROOT, Json, Machine, compose, make_secrets, service
+from tests.compose.compose_file import (
+    DOCKERFILE,
+    FILE,
+    OURS,
+    ROOT,
+    Json,
+    Machine,
+    compose,
+    make_secrets,
+    service,
+    stages,
+)
 from tests.compose.story import check_same_story, scraped
 from tests.loop.first_round import START_SECONDS, collected, first_round
 from tests.loop.processes import environment, eventually, free_port, started, stop
@@ -32,7 +43,26 @@ def test_the_file_is_what_the_compose_specification_says() -> None:
 
 
 def test_the_image_is_built_as_a_linter_likes_it() -> None:
-    checked("hadolint", str(ROOT / "docker" / "Dockerfile"))
+    checked("hadolint", str(DOCKERFILE))
+
+
+def test_each_image_is_built_from_a_stage_and_has_a_name_of_its_own() -> None:
+    targets = {name: service(name)["build"]["target"] for name in OURS}
+    assert targets == dict.fromkeys(OURS, "asim") | {"labeler": "labeler"}
+    assert set(targets.values()) <= set(stages())
+    assert len({(service(name)["image"], target) for name, target in targets.items()}) == 2
+    for target in targets.values():
+        assert stages()[target].rpartition("USER ")[2].startswith("10001:10001")
+
+
+def test_the_labelers_image_has_the_robot_simulators_as_make_installs_them() -> None:
+    recipe = (ROOT / "Makefile").read_text().partition("$(VENV)/.robots:")[2].partition("touch")[0]
+    groups = re.findall(r"-e '\.\[([\w,]+)\]'", recipe)
+    (bare,) = re.findall(r"--no-deps -c constraints\.txt (.+)", recipe)
+    assert groups == ["robosuite,maniskill"]
+    for word in (f",{groups[0]}]", f"--no-deps -c constraints.txt {bare}", "system-packages robots"):
+        assert word in stages()["labeler"]
+        assert word not in stages()["asim"]
 
 
 @pytest.mark.parametrize("name", compose()["services"])

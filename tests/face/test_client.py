@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from uuid import UUID, uuid4
 
 import httpx
@@ -306,3 +307,24 @@ def test_a_key_travels_as_a_bearer_token() -> None:
     script = Script(httpx.Response(200, json=[]))
     Client("http://service", key="secret", transport=httpx.MockTransport(script)).strategies()
     assert script.requests[0].headers["Authorization"] == "Bearer secret"
+
+
+def test_an_open_file_is_sent_whole_again_where_the_first_attempt_found_no_connection(tmp_path: Path) -> None:
+    content = pack({"grid": np.arange(200_000, dtype=np.uint8).reshape(2, -1)})
+    (tmp_path / "one.npz").write_bytes(content)
+    bodies: list[bytes] = []
+    told: list[httpx.Response | Exception] = [httpx.ConnectError("refused"), httpx.Response(201, json={"items": []})]
+    answers = iter(told)
+
+    def service(request: httpx.Request) -> httpx.Response:
+        bodies.append(request.read())
+        answer = next(answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    transport = Transport("http://service", None, 1.0, httpx.MockTransport(service), sleep=lambda seconds: None)
+    with (tmp_path / "one.npz").open("rb") as file:
+        transport.request("POST", "/trajectories", files=[("files", ("one.npz", file, "application/octet-stream"))])
+    assert len(bodies) == 2
+    assert all(content in body for body in bodies)

@@ -82,6 +82,39 @@ def test_a_recording_of_more_segments_than_a_request_takes_is_sent_in_several(
     assert (counts["pool_trajectories"], counts["labeled"]) == (2, 24)
 
 
+@pytest.mark.parametrize("labeled", [False, True])
+def test_an_import_names_the_file_that_is_refused_and_says_what_is_in(
+    asim: Command, own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, labeled: bool
+) -> None:
+    monkeypatch.setattr("asim.importing.UPLOAD_FILES", 3)
+    monkeypatch.setattr("asim.importing.BATCH_FILES", 3)
+    files = [recording(tmp_path / f"{seed}.npz", seed, labeled=labeled) for seed in range(20)]
+    with np.load(files[7]) as whole:
+        np.savez(files[7], **{**whole, "carried": whole["carried"].astype(np.int32)})
+    said = asim("import", own, *map(str, files), "--split", "pool", status=1)
+    assert f"{files[7]}: " in said
+    assert "carried: dtype" in said
+    assert said.count("\n") == 1
+    told = re.search(r"(\d+) of 20 files are in", said)
+    assert told is not None
+    assert 7 <= int(told[1]) <= 10  # a request that was on its way already is answered
+    assert json.loads(asim("project", "show", own))["counts"]["pool_trajectories"] == int(told[1])
+    recording(files[7], 7, labeled=labeled)
+    asim("import", own, *map(str, files), "--split", "pool")
+    assert json.loads(asim("project", "show", own))["counts"]["pool_trajectories"] == 20
+
+
+def test_a_file_that_cannot_be_read_stops_an_import_once_the_others_are_told(
+    asim: Command, own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("asim.importing.BATCH_FILES", 2)
+    files = [recording(tmp_path / f"{seed}.npz", seed, labeled=True) for seed in range(5)]
+    with np.load(files[4]) as whole:
+        np.savez(files[4], **{**whole, "actions": whole["actions"].astype("U1")})
+    said = asim("import", own, *map(str, files), "--split", "pool", status=1)
+    assert f"{files[4]}: actions have dtype <U1, not integers or floats; 4 of 5 files are in" in said
+
+
 def test_a_policy_is_changed_field_by_field(asim: Command, own: str) -> None:
     policy = json.loads(asim("project", "set", own, "--strategy", "random", "--label-budget", "5"))
     assert (policy["strategy"], policy["label_budget"], policy["round_labels"]) == ("random", 5, 0)

@@ -8,14 +8,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import TypeVar
+from typing import Any, TypeVar
 from uuid import UUID, uuid4
 
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
+from numpy.typing import NDArray
 
 from api_schemas.base import Page
-from api_schemas.environments import Environment
+from api_schemas.environments import Environment, Stream
 from api_schemas.events import Event
 from api_schemas.jobs import Job, JobState
 from api_schemas.projects import Budget, LabelingPolicy, PoolCounts, Project
@@ -29,7 +30,9 @@ from api_schemas.rounds import (
     RoundStatus,
     Stage,
 )
+from api_schemas.trajectories import Trajectory
 from service.dashboard.page import router
+from service.store import npz
 
 START = datetime(2026, 11, 22, 9, 0, tzinfo=UTC)
 Item = TypeVar("Item")
@@ -43,6 +46,7 @@ class CannedApi:
     rounds: list[Round] = field(default_factory=list)
     jobs: list[Job] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
+    recordings: dict[str, tuple[UUID, dict[str, NDArray[Any]]]] = field(default_factory=dict)
     key: str | None = None
     requests: list[str] = field(default_factory=list)
     not_modified: int = 0
@@ -113,6 +117,13 @@ class CannedApi:
         by = {"actor": actor, "correlation": "canned"}
         self.events.append(Event(id=identity, project=project, kind=kind, data=data, created_at=moment, **by))
 
+    def add_recording(self, project: UUID, arrays: dict[str, NDArray[Any]]) -> str:
+        """A trajectory; its id, which no content decides here."""
+        identity = f"{len(self.recordings):064x}"
+        self.recordings[identity] = (project, arrays)
+        self.add_event(project, "trajectory.added", {"trajectory": identity, "split": "pool"})
+        return identity
+
     def curve(self, project: UUID) -> ModelErrorCurve:
         points = [
             ModelErrorPoint(
@@ -141,6 +152,16 @@ def diagnostics(warnings: list[str]) -> Diagnostics:
     """Diagnostics that say only this."""
     nothing = dict.fromkeys(("mask", "support", "aliasing", "back_action", "back_action_in_support", "ranking"))
     return Diagnostics.model_validate({**nothing, "sampled": 0, "actions": [], "warnings": warnings})
+
+
+def trajectory(name: str, project: UUID, arrays: dict[str, NDArray[Any]]) -> Trajectory:
+    """What the API says of a recording."""
+    streams = {each: Stream.model_validate({"dtype": a.dtype.name, "shape": a.shape[1:]}) for each, a in arrays.items()}
+    transitions = len(next(iter(arrays.values()))) - 1
+    return Trajectory(
+        id=name, project=project, split="pool", transitions=transitions, segments=transitions, labeled=0,
+        streams=streams, bytes=1, has_provenance=False, created_at=START,
+    )  # fmt: skip
 
 
 def application(api: CannedApi) -> FastAPI:
@@ -188,6 +209,25 @@ def application(api: CannedApi) -> FastAPI:
     def jobs(project: UUID, request: Request) -> Page[Job]:
         check(request)
         return page([each for each in api.jobs if each.project == project])
+
+    @app.get("/trajectories", response_model=Page[Trajectory])
+    def trajectories(project: UUID, request: Request, limit: int = 100) -> Page[Trajectory]:
+        check(request)
+        own = [trajectory(name, *each) for name, each in api.recordings.items() if each[0] == project]
+        return page(own[:limit])
+
+    @app.get("/trajectories/{name}", response_model=Trajectory)
+    def one_trajectory(name: str, request: Request) -> Trajectory:
+        check(request)
+        if name not in api.recordings:
+            raise HTTPException(404, f"trajectory: there is no trajectory {name}")
+        return trajectory(name, *api.recordings[name])
+
+    @app.get("/trajectories/{name}/content")
+    def content(name: str, request: Request, start: int, length: int) -> Response:
+        check(request)
+        window = {each: array[start : start + length + 1] for each, array in api.recordings[name][1].items()}
+        return Response(npz.dump(window), media_type="application/octet-stream")
 
     @app.get("/events", response_model=Page[Event])
     def events(project: UUID, request: Request, newest: bool = False, limit: int = 100) -> Page[Event]:

@@ -114,6 +114,15 @@ def test_a_file_has_so_many_members_and_no_more(served: Served) -> None:
     refused(served.send(project, [("many.npz", many)]), 400, "foreign-file", "many.npz", 67, 66)
 
 
+def test_a_directory_is_refused_before_objects_are_made_of_it(served: Served) -> None:
+    project, buffer = served.project(environment=POINT), io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for number in range(2_000):
+            archive.writestr(f"point{number}.npy", b"")
+    answer = served.send(project, [("wide.npz", buffer.getvalue())])
+    refused(answer, 400, "foreign-file", "wide.npz", "a directory of", "65558 are allowed")
+
+
 def test_a_file_names_a_stream_once(served: Served) -> None:
     project, buffer = served.project(environment=POINT), io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive, warnings.catch_warnings():

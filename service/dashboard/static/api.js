@@ -1,4 +1,4 @@
-// GET requests to the JSON API of this origin, with ETags.
+// GET requests to the API of this origin: JSON with ETags, and bytes.
 
 const TIMEOUT_MS = 10_000;
 const KEY = "asim-key";
@@ -23,19 +23,22 @@ export function useKey(key) {
 
 /** JSON at `path`, relative to the page's folder. Repeats the last body when the service answers 304. */
 export async function get(path, params, signal) {
-  const url = new URL(path, document.baseURI);
-  for (const [name, value] of Object.entries(params ?? {})) if (value != null) url.searchParams.set(name, value);
+  const url = addressOf(path, params);
   const known = answers.get(url.href);
   const headers = { Accept: "application/json" };
   if (known) headers["If-None-Match"] = known.etag;
-  const key = sessionStorage.getItem(KEY);
-  if (key) headers.Authorization = `Bearer ${key}`;
   const response = await ask(url, headers, signal);
   if (response.status === 304 && known) return known.body;
   const body = await bodyOf(response);
   const etag = response.headers.get("ETag");
   if (etag) answers.set(url.href, { etag, body });
   return body;
+}
+
+/** The body at `path` as an ArrayBuffer. */
+export async function bytes(path, params, signal) {
+  const response = await ask(addressOf(path, params), {}, signal);
+  return response.ok ? response.arrayBuffer() : bodyOf(response);
 }
 
 /** The items of all pages of a listing, at most `pages` of them. */
@@ -51,7 +54,15 @@ export async function list(path, params, signal, pages = 10) {
   return items;
 }
 
+function addressOf(path, params) {
+  const url = new URL(path, document.baseURI);
+  for (const [name, value] of Object.entries(params ?? {})) if (value != null) url.searchParams.set(name, value);
+  return url;
+}
+
 async function ask(url, headers, signal) {
+  const key = sessionStorage.getItem(KEY);
+  if (key) headers.Authorization = `Bearer ${key}`;
   try {
     // no-store: the browser's own cache stays out of it, so a 304 arrives here as a 304
     return await fetch(url, { headers, cache: "no-store", signal: AbortSignal.any([signal, AbortSignal.timeout(TIMEOUT_MS)]) });

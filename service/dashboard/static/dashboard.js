@@ -3,6 +3,7 @@
 import { get, list, Refused, Unreachable, useKey } from "./api.js";
 import { drawCompare, drawCurves } from "./curves.js";
 import { byId, code, h, redraw, refreshTimes } from "./dom.js";
+import { askStrip, drawStrip } from "./filmstrip.js";
 import * as sections from "./sections.js";
 
 const POLL_MS = 1000 * Number(document.body.dataset.pollSeconds);
@@ -34,7 +35,8 @@ async function askProject(signal) {
     get("events", { project, newest: true, limit: SHOWN.events }, signal),
     ...compare.map((id) => curve(id).catch((error) => { if (error instanceof Refused) return { project: id, points: [] }; throw error; })),
   ]);
-  return { about, own, others, rounds: rounds.items, jobs: jobs.items, events: events.items };
+  const strip = await askStrip(about, events.items, signal);
+  return { about, own, others, strip, rounds: rounds.items, jobs: jobs.items, events: events.items };
 }
 
 async function ask(signal) {
@@ -51,7 +53,7 @@ function draw() {
   byId("project").hidden = !state.answers;
   byId("notice").hidden = Boolean(state.answers) || !state.projects;
   if (!state.answers) return void notice();
-  const { about, own, others, rounds, jobs, events } = state.answers;
+  const { about, own, others, strip, rounds, jobs, events } = state.answers;
   const advice = sections.curveAdvice(about, rounds);
   const nameOf = (id) => projects.find((each) => each.id === id)?.name ?? id.slice(0, 8);
   document.title = `${about.name} – ASIM`;
@@ -61,6 +63,7 @@ function draw() {
   sections.drawError(own.points, advice);
   drawCurves([{ name: about.name, points: own.points }, ...others.map((each) => ({ name: nameOf(each.project), points: each.points }))], advice);
   drawCompare(projects.filter((each) => each.id !== project), compare, toggle);
+  drawStrip(strip);
   sections.drawRounds(rounds, about);
   sections.drawJobs(jobs);
   sections.drawEvents(events);
