@@ -40,7 +40,6 @@ from workers.simulators.base import SearchableSimulator
 from workers.simulators.catalog import make_behavior, make_simulator
 
 TRAJECTORIES, SEGMENTS, SEED = 100, 200, 7
-FIRST = 1000  # transitions that are asked for before it is known how long a trajectory is
 WAIT = 600.0  # seconds for a queue
 
 
