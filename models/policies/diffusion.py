@@ -30,7 +30,7 @@ class DiffusionPolicyConfig:
     """
 
     chunk: int = 16
-    executed: int = 8
+    executed: int = 4
     channels: int = 32
     features: int = 128
     image_channels: int = 16
