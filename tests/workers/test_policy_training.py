@@ -224,7 +224,7 @@ def test_only_robots_have_policies(empty: Loop) -> None:
 
 
 def test_a_policy_of_images_learns_from_pictures(opened: OpenLoop) -> None:
-    loop = project_of(opened, "maniskill", cameras=True, horizon=12)
+    loop = project_of(opened, "maniskill", cameras=True, horizon=25)
     job = trained(loop, observations="images", stages=1, demonstrations=1)
     assert (job.state, job.error) == ("done", None)
     (policy,) = policies(loop)
