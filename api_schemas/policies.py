@@ -21,7 +21,7 @@ class PolicyCreate(Schema):
     """
 
     project: UUID
-    demonstrations: Annotated[int, Field(ge=1, le=1_000), AS_JSON] = 100
+    demonstrations: Annotated[int, Field(ge=1, le=1_000), AS_JSON] = 300
     stages: Annotated[int, Field(ge=1, le=20), AS_JSON] = 10
     observations: Form = "state"
     seed: Seed = 0

@@ -30,7 +30,7 @@ def request(
     if behavior.startswith(PREFIX):
         policies.choose(session, project, behavior, only, now)
     elif behavior not in behaviors:
-        raise UnknownBehavior("behavior", behavior, f"must be one of {', '.join(behaviors)}, or a policy")
+        raise UnknownBehavior("behavior", behavior, f"must be one of {', '.join(behaviors)}")
     if asked.labels is not None:
         _check_labels(project, asked.labels)
     chosen = asked.model_copy(update={"behavior": behavior})  # what a worker does is decided when it is asked

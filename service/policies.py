@@ -99,8 +99,7 @@ def choose(session: Session, project: ProjectRow, behavior: str, only: UUID | No
     if theirs != ours:
         raise InvalidField("behavior", behavior, f"is a policy of {theirs}, and this project is of {ours}")
     _check_form("behavior", behavior, project, row.observations)
-    fields = {column.name: getattr(row, column.name) for column in PolicyRow.__table__.columns}
-    session.merge(PolicyRow(**fields | {"project_id": project.id, "state_sha256": None, "created_at": now}))
+    queries.copy(session, row, project.id, now)
 
 
 def describe(row: PolicyRow) -> Policy:

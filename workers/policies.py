@@ -58,8 +58,8 @@ def look(simulator: Simulator, form: Form) -> Observation:
 class PolicyBehavior:
     """Takes the first actions of a chunk, then looks again and has the next one made.
 
-    It computes in double precision and rounds the actions to float32: how many threads a process has, and which kinds
-    of instructions its processor, changes the last bits of a sum, and labels by replay compare whole runs bit for bit.
+    It computes in double precision and rounds the actions to float32: how many threads a process has changes the last
+    bits of a sum, and labels by replay compare whole runs bit for bit.
     """
 
     def __init__(self, policy: DiffusionPolicy) -> None:

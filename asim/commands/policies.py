@@ -14,7 +14,7 @@ app = typer.Typer(no_args_is_help=True)
 def train(
     project: ProjectName,
     *,
-    demonstrations: Annotated[int, typer.Option(min=1, max=1000, help="Episodes of the expert to learn from.")] = 100,
+    demonstrations: Annotated[int, typer.Option(min=1, max=1000, help="Episodes of the expert to learn from.")] = 300,
     stages: Annotated[int, typer.Option(min=1, max=20, help="Of training, each kept as a policy.")] = 10,
     observations: Annotated[str, typer.Option(help="What it acts by: state or images.")] = "state",
     seed: Annotated[int, typer.Option(min=0, help="Of demonstrations and training.")] = 0,

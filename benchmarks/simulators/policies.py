@@ -84,16 +84,15 @@ def measure(task: Task, asked: argparse.Namespace) -> list[Figure]:
         print("  steps   clock  processor    loss  success")
         reached = stages(batch, simulator, asked.stages, asked.episodes)
     first, last = reached[0], reached[-1]
+    solved, goal = f"share of {asked.episodes} episodes solved", first.success + RISE
     rising = spearman(torch.arange(len(reached)), torch.tensor([stage.success for stage in reached]))
     minutes = (shown.wall + last.wall) / 60
     return [
         Figure(f"{task.name}_demonstrations", shown.processor, "s of processor time"),
         Figure(f"{task.name}_training", last.processor, "s of processor time"),
         Figure(f"{task.name}_time", minutes, "min by the clock, demonstrations and training", MINUTES, "below"),
-        Figure(f"{task.name}_first_stage", first.success, f"share of {asked.episodes} episodes solved"),
-        Figure(
-            f"{task.name}_last_stage", last.success, f"share of {asked.episodes} episodes solved", first.success + RISE
-        ),
+        Figure(f"{task.name}_first_stage", first.success, solved),
+        Figure(f"{task.name}_last_stage", last.success, solved, goal),
         Figure(f"{task.name}_order", rising or 0.0, "Spearman's rho of stage and success", ORDER),
     ]
 
@@ -113,7 +112,7 @@ def main() -> None:
     names = [task.name for task in TASKS]
     parser.add_argument("--task", choices=names, action="append", help=f"repeatable; default: {', '.join(SHOWN)}")
     parser.add_argument("--form", choices=("state", "images"), default="state", help="what the policy acts by")
-    parser.add_argument("--demonstrations", type=int, default=100, help="of the expert, a task")
+    parser.add_argument("--demonstrations", type=int, default=300, help="of the expert, a task")
     parser.add_argument("--stages", type=int, default=STAGES, help=f"up to which of the {STAGES} to train")
     parser.add_argument("--episodes", type=int, default=20, help="by which each stage's success is told")
     asked = parser.parse_args()

@@ -12,10 +12,10 @@ KERNEL, GROUPS = 5, 8
 FASTEST, SLOWEST = 1.0, 1e-4  # radians a noise step
 
 
-def step_embedding(steps: Tensor, size: int) -> Tensor:
-    """Sines and cosines of noise steps, (B,) -> float32 (B, size) (Vaswani et al. 2017)."""
-    exponents = torch.linspace(math.log(FASTEST), math.log(SLOWEST), size // 2, device=steps.device)
-    angles = steps[:, None].float() * exponents.exp()  # (B, size / 2)
+def step_embedding(steps: Tensor, size: int, dtype: torch.dtype) -> Tensor:
+    """Sines and cosines of noise steps, (B,) -> (B, size) (Vaswani et al. 2017)."""
+    exponents = torch.linspace(math.log(FASTEST), math.log(SLOWEST), size // 2, dtype=dtype, device=steps.device)
+    angles = steps[:, None].to(dtype) * exponents.exp()  # (B, size / 2)
     return torch.cat((angles.sin(), angles.cos()), 1)
 
 

@@ -30,7 +30,7 @@ class DiffusionPolicyConfig:
     """
 
     chunk: int = 16
-    executed: int = 8
+    executed: int = 4
     channels: int = 32
     features: int = 128
     image_channels: int = 16
@@ -122,7 +122,7 @@ class DiffusionPolicy(nn.Module):
 
     def predict(self, noisy: Tensor, steps: Tensor, features: Tensor) -> Tensor:
         """The noise in (B, chunk, D) after so many noise steps (B,), or the actions: see the config."""
-        embedded = step_embedding(steps, self.config.embedding).to(features.dtype)
+        embedded = step_embedding(steps, self.config.embedding, features.dtype)
         predicted: Tensor = self.unet(noisy, torch.cat((features, embedded), 1))
         return predicted
 

@@ -47,7 +47,7 @@ def _short_training(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def loop(opened: OpenLoop) -> Loop:
-    return project_of(opened, "maniskill", cameras=False, horizon=50)
+    return project_of(opened, "maniskill", cameras=False, horizon=25)
 
 
 def asked(loop: Loop, **more: Any) -> PolicyCreate:
@@ -101,7 +101,7 @@ def test_a_second_attempt_goes_on_from_the_last_stage_to_the_same_weights(
     monkeypatch.setattr(policy_training, "advance", counting(steps, advance))
     loop.drain()
     assert steps == stage_steps(STEPS, STAGES)[stopped_at:-1]
-    other = project_of(opened, "maniskill", cameras=False, horizon=50)
+    other = project_of(opened, "maniskill", cameras=False, horizon=25)
     assert trained(other).result == loop.client.job(job.id).result
 
 
@@ -171,7 +171,7 @@ def test_labels_of_a_policy_that_a_labeler_does_not_have_are_searched(loop: Loop
 def test_a_project_with_cameras_rolls_out_the_same_policy(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
     trained(loop)
     policy = policies(loop)[-1]
-    pictured = another_project(loop, "pictured", "maniskill", task="PullCube", cameras=True, horizon=50)
+    pictured = another_project(loop, "pictured", "maniskill", task="PullCube", cameras=True, horizon=25)
     job = pictured.collect(5, behavior=f"policy:{policy.id}", split="pool")
     assert (job.state, job.error) == ("done", None)
     assert [each.id for each in policies(pictured)] == [policy.id]
@@ -232,8 +232,8 @@ def test_only_robots_have_policies(empty: Loop) -> None:
 
 
 def test_a_policy_of_images_learns_from_pictures(opened: OpenLoop) -> None:
-    loop = project_of(opened, "maniskill", cameras=True, horizon=12)
-    job = trained(loop, observations="images", stages=1)
+    loop = project_of(opened, "maniskill", cameras=True, horizon=25)
+    job = trained(loop, observations="images", stages=1, demonstrations=1)
     assert (job.state, job.error) == ("done", None)
     (policy,) = policies(loop)
     assert (policy.observations, policy.steps) == ("images", STEPS)
