@@ -8,7 +8,7 @@ REPEAT ?= 50
 JOBS ?= 2
 
 .PHONY: help setup setup-robots system demo serve test test-slow test-robots audit lint types imports format bench-acquire \
-	bench-score bench-simulators bench-labels bench-paper-minigrid bench-paper-minigrid-full clean
+	bench-score bench-simulators bench-labels bench-world-model bench-paper-minigrid bench-paper-minigrid-full clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -81,6 +81,9 @@ bench-simulators: setup-robots ## steps a second of every robot task, and a pict
 
 bench-labels: setup-robots ## labels of robot tasks by replay and by search: right ones, errors, cost
 	$(BIN)/python -m benchmarks.simulators.labels
+
+bench-world-model: setup ## a training step of the robots' world model beside its bare convolutions and products (ARGS=--device cuda)
+	$(BIN)/python -m benchmarks.world_model $(ARGS)
 
 bench-paper-minigrid: setup ## the paper's MiniGrid figures, resumable (QUICK=1: 4a and 4d with four arms)
 	$(BIN)/python -m benchmarks.paper.minigrid $(if $(QUICK),--quick)

@@ -118,7 +118,7 @@ class RecurrentWorldModel(nn.Module):
 
         Raises ValueError where actions are missing: they can be left out for a single observation only.
         """
-        embeddings = self._embedded(self.streams.frame(observations))
+        embeddings = self.embed(self.streams.frame(observations))
         batch, steps = embeddings.shape[:2]
         expected = steps - (context is None)
         if actions is None and expected == 0:
@@ -138,7 +138,7 @@ class RecurrentWorldModel(nn.Module):
         The information that each observation adds to what the rollout expected: the dynamics loss, open-loop. Raises
         ValueError for other shapes.
         """
-        embeddings = self._embedded(self.streams.frame(reference))
+        embeddings = self.embed(self.streams.frame(reference))
         if prediction.shape[:2] != embeddings.shape[:2]:
             found, expected = tuple(prediction.shape[:2]), tuple(embeddings.shape[:2])
             raise ValueError(f"predictions {found} are of other steps than {expected}.")
@@ -166,16 +166,35 @@ class RecurrentWorldModel(nn.Module):
         Encoder, prior and decoder run over B*T at once.
         """
         frame = self.streams.frame(observations)
-        states, posterior = self.recurrence.filter(self._embedded(frame), self._scaled(actions), uniform)
+        states, divergence = self.latent(self.embed(frame), actions, uniform)
+        return (self.reconstruction(states, frame) + divergence).mean()
+
+    def embed(self, frame: Frame) -> Tensor:
+        """Frames (B, T, ...) -> embeddings (B, T, E)."""
+        some = frame.pixels if frame.pixels is not None else frame.numbers
+        assert some is not None  # noqa: S101  # there is a stream
+        rows = frame.flat(2)
+        parts = [rows] if torch.is_grad_enabled() else rows.split(FRAMES)
+        return torch.cat([self.encoder(part) for part in parts]).view(*some.shape[:2], -1)
+
+    def latent(self, embeddings: Tensor, actions: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """States (B, T, D) drawn by uniform (B, T, G), and the loss (B, T) of their divergence from the prior."""
+        states, posterior = self.recurrence.filter(embeddings, self._scaled(actions), uniform)
         prior = self.recurrence.prior(self.recurrence.split(states)[0])
         dynamics = categorical.kl_divergence(posterior.detach(), prior).clamp(min=self.config.free_nats)
         representation = categorical.kl_divergence(posterior, prior.detach()).clamp(min=self.config.free_nats)
-        reconstruction = self._reconstruction(self.decoder(states.flatten(0, 1)), frame.flat(2))
-        return (
-            reconstruction.mean()
-            + self.config.dynamics_weight * dynamics.mean()
-            + self.config.representation_weight * representation.mean()
-        )
+        config = self.config
+        return states, config.dynamics_weight * dynamics + config.representation_weight * representation
+
+    def reconstruction(self, states: Tensor, frame: Frame) -> Tensor:
+        """Squared error of what states (B, T, D) decode to, summed over a frame's pixels and numbers: (B, T)."""
+        decoded, seen = self._decoded(states.flatten(0, 1)), frame.flat(2)
+        parts = []
+        if decoded.pixels is not None and seen.pixels is not None:
+            parts.append(image.squared_error(decoded.pixels, seen.pixels))
+        if decoded.numbers is not None and seen.numbers is not None:
+            parts.append(self.config.numbers_weight * (decoded.numbers - seen.numbers).square().sum(1))
+        return torch.stack(parts).sum(0).view(states.shape[:2])
 
     def disagreement(self, decoded: Sequence[Observations]) -> Tensor:
         """Variance over the members of what they decode, summed over pixels and numbers, weighted as in the loss."""
@@ -219,27 +238,10 @@ class RecurrentWorldModel(nn.Module):
             changed += visible.flatten(1).sum(1)
         return correct, changed
 
-    def _reconstruction(self, decoded: Frame, seen: Frame) -> Tensor:
-        """(N, ...) twice -> (N,)."""
-        parts = []
-        if decoded.pixels is not None and seen.pixels is not None:
-            parts.append(image.squared_error(decoded.pixels, seen.pixels))
-        if decoded.numbers is not None and seen.numbers is not None:
-            parts.append(self.config.numbers_weight * (decoded.numbers - seen.numbers).square().sum(1))
-        return torch.stack(parts).sum(0)
-
     def _scaled(self, actions: Tensor) -> Tensor:
         """From the box to [-1, 1]."""
         middle, half = (self.action.high + self.action.low) / 2, (self.action.high - self.action.low) / 2
         return (actions.float() - middle) / half
-
-    def _embedded(self, frame: Frame) -> Tensor:
-        """Frames (B, T, ...) -> embeddings (B, T, E)."""
-        some = frame.pixels if frame.pixels is not None else frame.numbers
-        assert some is not None  # noqa: S101  # there is a stream
-        rows = frame.flat(2)
-        parts = [rows] if torch.is_grad_enabled() else rows.split(FRAMES)
-        return torch.cat([self.encoder(part) for part in parts]).view(*some.shape[:2], -1)
 
     def _decoded(self, state: Tensor) -> Frame:
         frame: Frame = self.decoder(state)

@@ -92,9 +92,9 @@ def test_all_steps_at_once_are_one_step_after_the_other(point: RecurrentWorldMod
 
 def test_the_encoder_of_all_frames_is_that_of_each() -> None:
     model, batch = _model(toy_robot.PICTURE), toy_robot.pictures(3, 5, seed=0)
-    together = model._embedded(model.streams.frame(batch.observations))
+    together = model.embed(model.streams.frame(batch.observations))
     for step in range(6):
-        alone = model._embedded(model.streams.frame({"camera": batch.observations["camera"][:, step : step + 1]}))
+        alone = model.embed(model.streams.frame({"camera": batch.observations["camera"][:, step : step + 1]}))
         torch.testing.assert_close(alone[:, 0], together[:, step])
 
 
@@ -126,6 +126,15 @@ def test_a_divergence_below_the_free_nats_costs_them_and_teaches_nothing() -> No
     assert losses[1] - losses[0] == pytest.approx(0.6, abs=1e-4)  # (.5 + .1) of a nat
     assert gradients[0] > 0.0
     assert gradients[1] == 0.0
+
+
+def test_the_loss_compiles_as_one_graph() -> None:
+    model, batch = _model(toy_robot.PICTURE), toy_robot.pictures(4, 5, seed=0)
+    before = model.loss(batch, torch.Generator().manual_seed(0))
+    model.compile(backend="eager", fullgraph=True)
+    after = model.loss(batch, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(after, before)
+    after.backward()  # type: ignore[no-untyped-call]  # untyped in torch
 
 
 def test_one_generator_gives_one_result() -> None:
