@@ -82,7 +82,7 @@ bench-simulators: setup-robots ## steps a second of every robot task, and a pict
 bench-labels: setup-robots ## labels of robot tasks by replay and by search: right ones, errors, cost
 	$(BIN)/python -m benchmarks.simulators.labels
 
-bench-world-model: setup ## a training step of the robots' world model beside its bare convolutions and products (ARGS=--device cuda)
+bench-world-model: setup ## a training step of the robots' world model beside its bare products (ARGS="--device cuda --compile")
 	$(BIN)/python -m benchmarks.world_model $(ARGS)
 
 bench-paper-minigrid: setup ## the paper's MiniGrid figures, resumable (QUICK=1: 4a and 4d with four arms)

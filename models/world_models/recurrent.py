@@ -49,10 +49,11 @@ SMALL = RecurrentWorldModelConfig(
     groups=16,
     classes=16,
     hidden=256,
-    depth=12,
+    depth=16,
     units=256,
     layers=2,
     window=16,
+    reads_first=True,
     standardised=True,
     numbers_weight=10.0,
 )

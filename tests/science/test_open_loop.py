@@ -5,24 +5,8 @@ import torch
 from torch import Tensor
 
 from models.open_loop import open_loop_errors
-from models.segments import Observations, SegmentBatch
-from models.world_models.recurrent import RecurrentWorldModel
+from models.segments import SegmentBatch
 from tests.science import toy_robot
-
-
-class Standstill(RecurrentWorldModel):
-    """Predicts the present for ever."""
-
-    def infer_state(
-        self, observations: Observations, actions: Tensor | None = None, context: Tensor | None = None
-    ) -> Tensor:
-        return next(iter(observations.values()))[:, -1]
-
-    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        return torch.stack([state] * actions.shape[1], 1)
-
-    def observe(self, state: Tensor) -> Observations:
-        return {next(iter(self.spaces.observations)): state}
 
 
 def _batch(stream: str, values: Tensor) -> SegmentBatch:
@@ -30,7 +14,7 @@ def _batch(stream: str, values: Tensor) -> SegmentBatch:
 
 
 def test_numbers_count_in_their_units() -> None:
-    model = Standstill(toy_robot.POINT, toy_robot.TINY, torch.Generator())
+    model = toy_robot.Standstill(toy_robot.POINT, toy_robot.TINY, torch.Generator())
     path = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], [[0.0, 0.0], [0.0, 0.0], [0.0, 4.0]]])
     errors = open_loop_errors(model, _batch("position", path), horizons=(1, 2), chunk=1)
     assert errors[1]["position"] == pytest.approx((1 / 2 + 0) / 2)  # two coordinates, two segments
@@ -38,14 +22,14 @@ def test_numbers_count_in_their_units() -> None:
 
 
 def test_pixels_count_as_shares_of_white() -> None:
-    model = Standstill(toy_robot.PICTURE, toy_robot.TINY, torch.Generator())
+    model = toy_robot.Standstill(toy_robot.PICTURE, toy_robot.TINY, torch.Generator())
     film = torch.zeros(1, 2, 16, 16, 3, dtype=torch.uint8)
     film[0, 1, :8] = 255
     assert open_loop_errors(model, _batch("camera", film), horizons=(1,))[1]["camera"] == pytest.approx(0.5)
 
 
 def test_segments_shorter_than_the_horizon_are_refused() -> None:
-    model = Standstill(toy_robot.POINT, toy_robot.TINY, torch.Generator())
+    model = toy_robot.Standstill(toy_robot.POINT, toy_robot.TINY, torch.Generator())
     with pytest.raises(ValueError, match="Segments of 4 steps are too short for a horizon of 32"):
         open_loop_errors(model, toy_robot.points(2, 4, seed=0))
     with pytest.raises(ValueError, match="no actions"):

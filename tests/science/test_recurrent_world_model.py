@@ -105,6 +105,41 @@ def test_a_rollout_is_repeated_prediction(point: RecurrentWorldModel, unseen: Se
     torch.testing.assert_close(point.rollout(state, unseen.actions)[:, 1], twice)
 
 
+def test_predictions_of_other_steps_are_refused(point: RecurrentWorldModel, unseen: SegmentBatch) -> None:
+    assert unseen.actions is not None
+    prediction = point.rollout(point.infer_state(first(unseen.observations)), unseen.actions[:, :3])
+    with pytest.raises(ValueError, match=r"predictions \(100, 3\) are of other steps than \(100, 8\)"):
+        point.distance(prediction, future(unseen.observations))
+
+
+def test_what_stands_still_predicts_no_change() -> None:
+    still = toy_robot.Standstill(toy_robot.PICTURE, toy_robot.TINY, torch.Generator())
+    camera = torch.zeros(1, 2, 16, 16, 3, dtype=torch.uint8)
+    camera[0, 1, 3, :5] = 200
+    camera[0, 1, 9] = 10  # not to be seen
+    correct, changed = still.changes(camera[:, 0], {"camera": camera})
+    assert (correct.tolist(), changed.tolist()) == ([0], [15])
+    almost = (camera[:, 1].float() * 0.8).byte()
+    assert still.changes(almost, {"camera": camera})[0].tolist() == [15]
+
+
+@torch.inference_mode()
+def test_members_that_agree_disagree_by_nothing(point: RecurrentWorldModel, unseen: SegmentBatch) -> None:
+    decoded = point.decode(point.encode(at(unseen.observations, 0)))
+    other = {name: stream + 0.5 for name, stream in decoded.items()}
+    assert float(point.disagreement([decoded, decoded, decoded]).max()) == 0.0
+    expected = 2 * 100.0 * 0.25**2  # two coordinates, the weight of numbers, the variance of two members
+    torch.testing.assert_close(point.disagreement([decoded, other]), torch.full((unseen.size,), expected))
+
+
+def test_signatures_tell_which_way_a_segment_goes(point: RecurrentWorldModel) -> None:
+    position = torch.tensor([[[0.0, 0.0], [1.5, 0.0]], [[-0.6, 0.3], [0.9, 0.31]], [[0.0, 0.0], [0.0, -1.5]]])
+    actions = torch.tensor([[[1.0, 0.1]], [[0.8, -0.2]], [[0.1, -0.9]]])
+    signatures = point.signatures({"position": position}, actions)
+    assert signatures.tolist() == [[1, 0, 1, 0], [1, 0, 1, 0], [0, -1, 0, -1]]
+    assert point.latent_features({"position": position}, actions).shape == (3, toy_robot.TINY.deterministic)
+
+
 def test_missing_actions_are_counted(point: RecurrentWorldModel, unseen: SegmentBatch) -> None:
     with pytest.raises(ValueError, match="9 observations have 8 actions between them, got none"):
         point.infer_state(unseen.observations)

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from models.segments import Segment, SegmentBatch
+from models.segments import Observations, Segment, SegmentBatch
 from models.spaces import BoxAction, Spaces, StreamSpec
-from models.world_models.recurrent import RecurrentWorldModelConfig
+from models.world_models.recurrent import RecurrentWorldModel, RecurrentWorldModelConfig
 
 STEP = 0.3  # of an action of 1; the world ends at -1 and 1
 ACTION = BoxAction(-1.0, 1.0, (2,))
@@ -25,6 +25,21 @@ TINY = RecurrentWorldModelConfig(
     standardised=True,
     numbers_weight=100.0,
 )
+
+
+class Standstill(RecurrentWorldModel):
+    """Predicts the present for ever; its states are the observations of its only stream."""
+
+    def infer_state(
+        self, observations: Observations, actions: Tensor | None = None, context: Tensor | None = None
+    ) -> Tensor:
+        return next(iter(observations.values()))[:, -1]
+
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        return torch.stack([state] * actions.shape[1], 1)
+
+    def observe(self, state: Tensor) -> Observations:
+        return {next(iter(self.spaces.observations)): state}
 
 
 def paths(count: int, length: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
