@@ -109,13 +109,12 @@ class SegmentBatch:
         if self.action_sets is not None:
             raise ValueError("Windows are cut from segments of continuous actions; the batch carries action sets.")
         starts = torch.randint(self.length - length + 1, (self.size, 1), generator=generator, device=generator.device)
+        named = zip(self.segments, starts, strict=False)  # names may be left empty
         every, steps = torch.arange(self.size).unsqueeze(1), starts.cpu() + torch.arange(length + 1)  # (B, length+1)
         return SegmentBatch(
             observations={name: stream[every, steps] for name, stream in self.observations.items()},
             actions=None if self.actions is None else self.actions[every, steps[:, :-1]],
-            segments=tuple(
-                Segment(n.trajectory, n.start + int(s)) for n, s in zip(self.segments, starts, strict=False)
-            ),
+            segments=tuple(Segment(name.trajectory, name.start + int(at)) for name, at in named),
         )
 
     def with_drawn_actions(self, generator: torch.Generator) -> "SegmentBatch":

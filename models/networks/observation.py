@@ -30,12 +30,6 @@ class Frame(NamedTuple):
         """The first `lead` dimensions as one."""
         return Frame(*(None if part is None else part.flatten(0, lead - 1) for part in self))
 
-    def split(self, size: int) -> list["Frame"]:
-        """Frames of at most `size` rows each."""
-        parts = [None if part is None else part.split(size) for part in self]  # type: ignore[no-untyped-call]  # in torch
-        count = next(len(part) for part in parts if part is not None)
-        return [Frame(*(None if part is None else part[place] for part in parts)) for place in range(count)]
-
 
 @dataclass(frozen=True)
 class ObservationNetworkConfig:

@@ -20,7 +20,7 @@ from models.segments import Observations, SegmentBatch
 from models.spaces import BoxAction, Spaces
 
 VISIBLE_GREY, VISIBLE = 16.0, 1e-3  # of 255 levels, and of a number: what is less is no change
-FRAMES = 512  # encoded or decoded at a time where no gradient needs them all: bounds memory
+FRAMES = 512  # encoded at a time outside of training: bounds memory
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,7 @@ class RecurrentWorldModel(nn.Module):
         for name, stream in streams.items():
             broken = (~stream.isfinite()).flatten(1).any(1).nonzero().flatten()
             if len(broken):
-                row = int(broken[0])
-                where = (
-                    f"{batch.segments[row].trajectory}:{batch.segments[row].start}" if batch.segments else f"row {row}"
-                )
+                where = batch.name(int(broken[0]))
                 raise ValueError(f"{name} of segment {where} holds a number that is not finite.")
 
     def encode(self, observations: Observations) -> Tensor:
@@ -119,7 +116,7 @@ class RecurrentWorldModel(nn.Module):
 
         Raises ValueError where actions are missing: they can be left out for a single observation only.
         """
-        embeddings = self.embed(self.streams.frame(observations))
+        embeddings = self._read(observations)
         batch, steps = embeddings.shape[:2]
         expected = steps - (context is None)
         if actions is None and expected == 0:
@@ -139,7 +136,7 @@ class RecurrentWorldModel(nn.Module):
         The information that each observation adds to what the rollout expected: the dynamics loss, open-loop. Raises
         ValueError for other shapes.
         """
-        embeddings = self.embed(self.streams.frame(reference))
+        embeddings = self._read(reference)
         if prediction.shape[:2] != embeddings.shape[:2]:
             found, expected = tuple(prediction.shape[:2]), tuple(embeddings.shape[:2])
             raise ValueError(f"predictions {found} are of other steps than {expected}.")
@@ -174,9 +171,8 @@ class RecurrentWorldModel(nn.Module):
         """Frames (B, T, ...) -> embeddings (B, T, E)."""
         some = frame.pixels if frame.pixels is not None else frame.numbers
         assert some is not None  # noqa: S101  # there is a stream
-        rows = frame.flat(2)
-        parts = [rows] if torch.is_grad_enabled() else rows.split(FRAMES)
-        return torch.cat([self.encoder(part) for part in parts]).view(*some.shape[:2], -1)
+        embeddings: Tensor = self.encoder(frame.flat(2))
+        return embeddings.view(*some.shape[:2], -1)
 
     def latent(self, embeddings: Tensor, actions: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """States (B, T, D) drawn by uniform (B, T, G), and the loss (B, T) of their divergence from the prior."""
@@ -243,6 +239,16 @@ class RecurrentWorldModel(nn.Module):
         """From the box to [-1, 1]."""
         middle, half = (self.action.high + self.action.low) / 2, (self.action.high - self.action.low) / 2
         return (actions.float() - middle) / half
+
+    def _read(self, observations: Observations) -> Tensor:
+        """(B, T, ...) -> embeddings (B, T, E), a part of the frames at a time: as floats all may be too many."""
+        batch, steps = next(iter(observations.values())).shape[:2]
+        rows = {name: stream.flatten(0, 1) for name, stream in observations.items()}
+        parts = [
+            self.encoder(self.streams.frame({name: stream[start : start + FRAMES] for name, stream in rows.items()}))
+            for start in range(0, max(1, batch * steps), FRAMES)
+        ]
+        return torch.cat(parts).view(batch, steps, self.encoder.outputs)
 
     def _decoded(self, state: Tensor) -> Frame:
         frame: Frame = self.decoder(state)

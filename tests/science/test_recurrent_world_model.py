@@ -9,6 +9,7 @@ from torch import Tensor
 from models.segments import Observations, SegmentBatch, at, first, future
 from models.spaces import BoxAction, DiscreteAction, Spaces, StreamSpec
 from models.training import NonFiniteError, TrainingConfig, TrainingState, advance, begin, train
+from models.world_models import recurrent
 from models.world_models.recurrent import PAPER, RecurrentWorldModel, RecurrentWorldModelConfig
 from tests.science import toy_robot
 
@@ -96,6 +97,15 @@ def test_the_encoder_of_all_frames_is_that_of_each() -> None:
     for step in range(6):
         alone = model.embed(model.streams.frame({"camera": batch.observations["camera"][:, step : step + 1]}))
         torch.testing.assert_close(alone[:, 0], together[:, step])
+
+
+def test_more_frames_than_are_read_at_a_time_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, batch = _model(toy_robot.PICTURE), toy_robot.pictures(5, 3, seed=0)
+    whole = model.infer_state(batch.observations, batch.actions)
+    monkeypatch.setattr(recurrent, "FRAMES", 3)
+    torch.testing.assert_close(model.infer_state(batch.observations, batch.actions), whole)
+    nothing = batch.take(slice(0, 0))
+    assert model.infer_state(nothing.observations, nothing.actions).shape == (0, toy_robot.TINY.state)
 
 
 def test_a_rollout_is_repeated_prediction(point: RecurrentWorldModel, unseen: SegmentBatch) -> None:
