@@ -8,8 +8,8 @@ REPEAT ?= 50
 JOBS ?= 2
 
 .PHONY: help setup setup-robots system demo serve test test-slow test-robots audit lint types imports format bench-acquire \
-	bench-score bench-import bench-simulators bench-labels bench-robot-projects bench-policies bench-paper-minigrid \
-	bench-paper-minigrid-full clean
+	bench-score bench-import bench-simulators bench-labels bench-robot-projects bench-policies bench-world-model \
+	bench-paper-minigrid bench-paper-minigrid-full clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -91,6 +91,9 @@ bench-policies: setup-robots ## diffusion policies of Lift and PullCube: success
 
 bench-robot-projects: setup-robots ## every robot task through the service: collected, acquired, labeled, compared (an hour)
 	$(BIN)/python -m benchmarks.simulators.projects
+
+bench-world-model: setup ## a training step of the robots' world model beside its bare products (ARGS="--device cuda --compile")
+	$(BIN)/python -m benchmarks.world_model $(ARGS)
 
 bench-paper-minigrid: setup ## the paper's MiniGrid figures, resumable (QUICK=1: 4a and 4d with four arms)
 	$(BIN)/python -m benchmarks.paper.minigrid $(if $(QUICK),--quick)

@@ -1,7 +1,7 @@
 """Which world model, inverse dynamics and subgoal generator belong together, and how each is trained by default."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import torch
@@ -19,20 +19,25 @@ from models.inverse_dynamics.grid import (
     SparseInverseDynamicsConfig,
 )
 from models.network import KINDS, Network
+from models.networks.observation import check_spaces as check_robot_spaces
 from models.spaces import BoxAction, DiscreteAction, Spaces, StreamSpec
 from models.subgoal_generators.base import SubgoalGenerator
 from models.subgoal_generators.grid import GridSubgoalGenerator, GridSubgoalGeneratorConfig
 from models.training import TrainingConfig
 from models.world_models.base import WorldModel
 from models.world_models.grid import GridWorldModel, GridWorldModelConfig
+from models.world_models.recurrent import PAPER, SMALL, RecurrentWorldModel, RecurrentWorldModelConfig
 
 __all__ = [
     "FAMILIES",
     "GRID",
+    "ROBOT",
+    "ROBOT_PAPER",
     "BoxAction",
     "DiscreteAction",
     "Family",
     "GridFamily",
+    "RobotFamily",
     "Spaces",
     "StreamSpec",
     "family_named",
@@ -162,7 +167,48 @@ class GridFamily:
         raise ValueError(f"The grid family trains {', '.join(KINDS)}; got {kind!r}.")
 
 
+@dataclass(frozen=True)
+class RobotFamily:
+    """Robots: camera images and vectors of numbers, actions in a box.
+
+    preset: the world model's config where none is given. small: its training, for hours of two processor cores; the
+    paper's preset trains as the paper does.
+    """
+
+    preset: RecurrentWorldModelConfig = SMALL
+    name: str = "robot"
+
+    def check_spaces(self, spaces: Spaces) -> None:
+        """Raises ValueError, in a sentence, for spaces other than the family's."""
+        check_robot_spaces(spaces)
+
+    def build_world_model(
+        self, spaces: Spaces, config: RecurrentWorldModelConfig | None, generator: torch.Generator
+    ) -> RecurrentWorldModel:
+        """All parameters are drawn from `generator`."""
+        return RecurrentWorldModel(spaces, config or self.preset, generator)
+
+    def build(self, kind: str, spaces: Spaces, config: Mapping[str, Any], generator: torch.Generator) -> Network:
+        """Raises ValueError for another kind, TypeError for a config with other fields."""
+        if kind == "world_model":
+            return self.build_world_model(spaces, replace(self.preset, **config), generator)
+        raise ValueError(f"The robot family builds world_model; got {kind!r}.")
+
+    def training_config(self, kind: str, segments: int) -> TrainingConfig:
+        """One schedule a kind, the same for every strategy and any number of segments."""
+        if kind == "world_model":
+            return _WORLD_MODEL_TRAINING[self.preset]
+        raise ValueError(f"The robot family trains world_model; got {kind!r}.")
+
+
+_WORLD_MODEL_TRAINING = {
+    PAPER: TrainingConfig(200_000, 16, 1e-4, 0.0, warm_up=0.0, clip=1000.0, constant=True),
+    SMALL: TrainingConfig(1200, 8, 1e-3, 0.0, clip=100.0),
+}
+
 GRID = GridFamily()
+ROBOT = RobotFamily()
+ROBOT_PAPER = RobotFamily(PAPER)
 FAMILIES: dict[str, Family] = {GRID.name: GRID}
 
 

@@ -77,6 +77,10 @@ class SegmentBatch:
             segments=self._names(indices),
         )
 
+    def name(self, row: int) -> str:
+        """Segment `row` as messages name it."""
+        return f"{self.segments[row].trajectory}:{self.segments[row].start}" if self.segments else f"row {row}"
+
     def _names(self, indices: Tensor | slice) -> tuple[Segment, ...]:
         if not self.segments or isinstance(indices, slice):
             return self.segments[indices] if isinstance(indices, slice) else ()
@@ -93,6 +97,24 @@ class SegmentBatch:
             actions=None if self.actions is None else self.actions.flatten(0, 1).unsqueeze(1),
             action_sets=None if self.action_sets is None else self.action_sets.flatten(0, 1).unsqueeze(1),
             segments=tuple(names),
+        )
+
+    def windows(self, length: int, generator: torch.Generator) -> "SegmentBatch":
+        """Of each segment `length` transitions in a row, from a start of its own drawn by the generator.
+
+        Segments that are no longer stay whole. Raises ValueError for a batch with action sets.
+        """
+        if self.length <= length:
+            return self
+        if self.action_sets is not None:
+            raise ValueError("Windows are cut from segments of continuous actions; the batch carries action sets.")
+        starts = torch.randint(self.length - length + 1, (self.size, 1), generator=generator, device=generator.device)
+        named = zip(self.segments, starts, strict=False)  # names may be left empty
+        every, steps = torch.arange(self.size).unsqueeze(1), starts.cpu() + torch.arange(length + 1)  # (B, length+1)
+        return SegmentBatch(
+            observations={name: stream[every, steps] for name, stream in self.observations.items()},
+            actions=None if self.actions is None else self.actions[every, steps[:, :-1]],
+            segments=tuple(Segment(name.trajectory, name.start + int(at)) for name, at in named),
         )
 
     def with_drawn_actions(self, generator: torch.Generator) -> "SegmentBatch":

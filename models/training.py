@@ -1,4 +1,4 @@
-"""Training of any network: AdamW, one-cycle learning rate, clipped gradients; resumable at every step, bit for bit."""
+"""Training of any network: AdamW, scheduled learning rate, clipped gradients; resumable at every step, bit for bit."""
 
 import json
 import math
@@ -25,7 +25,10 @@ class NonFiniteError(ValueError):
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """`warm_up` is the share of the steps in which the learning rate rises from 0; a cosine brings it back to 0."""
+    """`warm_up` is the share of the steps in which the learning rate rises from 0.
+
+    After it a cosine brings it back to 0, or, where it is `constant`, it stays.
+    """
 
     steps: int
     batch_size: int
@@ -33,6 +36,7 @@ class TrainingConfig:
     weight_decay: float
     warm_up: float = 0.15
     clip: float = 1.0  # largest norm of the gradient
+    constant: bool = False
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.batch_size < 1:
@@ -115,7 +119,7 @@ def advance(
     """
     _check_dataset(model, dataset)
     model.to(device)
-    run = _Run(model, dataset.to(device), state)
+    run = _Run(model, dataset, state, device)
     for step in range(state.step, until):
         loss = run.step(step)
         if progress is not None and ((step + 1) % PROGRESS_EVERY == 0 or step + 1 == until):
@@ -124,10 +128,12 @@ def advance(
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
-    """One cycle: linear warm-up, then a cosine to zero. `step` counts from 0."""
+    """One cycle: linear warm-up, then a cosine to zero, or constant. `step` counts from 0."""
     rise = max(1.0, config.warm_up * config.steps)
     if step < rise:
         return config.learning_rate * (step + 1) / (rise + 1)
+    if config.constant:
+        return config.learning_rate
     fraction = (step - rise) / max(1.0, config.steps - rise)
     return config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * fraction))
 
@@ -141,8 +147,8 @@ def _check_dataset(model: Network, dataset: SegmentBatch) -> None:
 class _Run:
     """One slice of training: the model, its optimiser and generator, restored from a state."""
 
-    def __init__(self, model: Network, dataset: SegmentBatch, state: TrainingState) -> None:
-        self.model, self.dataset, self.config = model, dataset, state.config
+    def __init__(self, model: Network, dataset: SegmentBatch, state: TrainingState, device: torch.device | str) -> None:
+        self.model, self.config, self.device = model, state.config, device
         self.names = dataset.segments
         self.dataset = SegmentBatch(dataset.observations, dataset.actions, dataset.action_sets)
         model.load_state_dict(_under(state.tensors, "model."))
@@ -162,7 +168,8 @@ class _Run:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.config, step)
         self.optimiser.zero_grad()
-        loss = self.model.loss(self.dataset.take(indices), self.generator)
+        minibatch = self.dataset.take(indices).to(self.device)  # all of it may be too much for a device
+        loss = self.model.loss(minibatch, self.generator)
         value = float(loss.detach())
         self._require_finite("loss", value, step, indices)
         loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it unannotated

@@ -46,3 +46,24 @@ def test_transitions_cut_long_segments_into_pairs() -> None:
     assert pairs.actions is not None
     assert pairs.actions.tolist() == [[1], [2], [3], [4]]
     assert pairs.segments == (Segment("a", 0), Segment("a", 1), Segment("b", 5), Segment("b", 6))
+
+
+def test_windows_are_cut_from_a_start_of_each_segment_s_own() -> None:
+    frames = torch.arange(9).expand(40, 9)
+    actions = torch.arange(8.0).expand(40, 8).unsqueeze(2)
+    batch = SegmentBatch({"x": frames}, actions, segments=tuple(Segment("a", 10 * row) for row in range(40)))
+    cut = batch.windows(3, torch.Generator().manual_seed(0))
+    starts = cut.observations["x"][:, 0]
+    assert set(starts.tolist()) == set(range(6))
+    assert torch.equal(cut.observations["x"], starts.unsqueeze(1) + torch.arange(4))
+    assert cut.actions is not None
+    assert torch.equal(cut.actions.squeeze(2), (starts.unsqueeze(1) + torch.arange(3)).float())
+    assert [name.start for name in cut.segments] == [10 * row + int(start) for row, start in enumerate(starts)]
+    assert batch.windows(8, torch.Generator()) is batch
+
+
+def test_windows_of_action_sets_are_refused() -> None:
+    frames = {"x": torch.zeros(1, 3, 1)}
+    batch = SegmentBatch(frames, torch.zeros(1, 2, dtype=torch.int64), torch.ones(1, 2, 4, dtype=torch.bool))
+    with pytest.raises(ValueError, match="the batch carries action sets"):
+        batch.windows(1, torch.Generator())

@@ -86,6 +86,13 @@ def test_the_learning_rate_rises_then_falls_to_nothing() -> None:
     assert rates[-1] < 0.001
 
 
+def test_a_constant_learning_rate_stays_after_the_warm_up() -> None:
+    config = TrainingConfig(100, 1, 1.0, 0.0, warm_up=0.1, constant=True)
+    rates = [learning_rate(config, step) for step in range(100)]
+    assert rates[:11] == sorted(rates[:11])
+    assert set(rates[10:]) == {1.0}
+
+
 def test_foreign_bytes_are_no_training_state() -> None:
     with pytest.raises(ValueError, match="no training state"):
         TrainingState.from_bytes(b"not safetensors at all")

@@ -1,0 +1,1 @@
+"""Speed of the recurrent world model's training."""

@@ -1,0 +1,58 @@
+"""Open-loop errors: how far a world model's predictions are from what was observed, after one observation."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from models.segments import SegmentBatch, first
+from models.world_models.base import WorldModel
+
+HORIZONS = (8, 32)
+
+
+@torch.inference_mode()
+def open_loop_errors(
+    world_model: WorldModel,
+    batch: SegmentBatch,
+    horizons: Sequence[int] = HORIZONS,
+    chunk: int = 32,
+    after_each: Callable[[], None] = lambda: None,
+) -> dict[int, dict[str, float]]:
+    """Horizon -> stream -> squared error, mean over segments, over the steps up to the horizon and over coordinates.
+
+    Images are in [0, 1], so theirs is the per-pixel error; numbers in their units, squared. The model sees the first
+    observation and all actions. after_each: called after each chunk; may raise to stop. Raises ValueError for a batch
+    without segments or actions, or of segments that are shorter than a horizon.
+    """
+    if batch.actions is None or batch.size == 0:
+        found = "no segment" if batch.size == 0 else "no actions"
+        raise ValueError(f"Open-loop errors need labeled segments; the batch carries {found}.")
+    if batch.length < max(horizons):
+        raise ValueError(f"Segments of {batch.length} steps are too short for a horizon of {max(horizons)}.")
+    total = dict[str, Tensor]()
+    for start in range(0, batch.size, chunk):
+        for name, errors in _errors(world_model, batch.take(slice(start, start + chunk))).items():
+            total[name] = total.get(name, torch.zeros(())) + errors.sum(0).double().cpu()
+        after_each()
+    return {
+        horizon: {name: float(errors[:horizon].mean()) / batch.size for name, errors in total.items()}
+        for horizon in horizons
+    }
+
+
+def _errors(world_model: WorldModel, batch: SegmentBatch) -> dict[str, Tensor]:
+    """Of each stream, mean over coordinates: (B, L)."""
+    assert batch.actions is not None  # noqa: S101  # checked above
+    prediction = world_model.rollout(world_model.infer_state(first(batch.observations)), batch.actions)
+    steps = []
+    for step, state in enumerate(prediction.unbind(1), 1):  # one step's images at a time
+        guess = world_model.observe(state)
+        steps.append({name: _squared(guess[name], stream[:, step]) for name, stream in batch.observations.items()})
+    return {name: torch.stack([each[name] for each in steps], 1) for name in batch.observations}
+
+
+def _squared(guess: Tensor, truth: Tensor) -> Tensor:
+    """(B, ...) twice -> (B,)."""
+    scale = 1.0 if truth.is_floating_point() else 255.0
+    return ((guess.float() - truth.float()) / scale).square().flatten(1).mean(1)
