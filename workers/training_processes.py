@@ -4,7 +4,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from copy import deepcopy
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from models.network import Network
 from models.segments import SegmentBatch
 from models.training import TrainingState, advance
 
-ENDING, LOOK = 10.0, 0.2  # seconds that processes are given to end by themselves; between two looks at all of them
+ENDING, LOOK = 10.0, 0.5  # seconds that processes are given to end by themselves; between two looks at all of them
 
 
 class TrainingProcesses:
@@ -53,10 +53,11 @@ class TrainingProcesses:
                 connection.send(until)
             except OSError as error:
                 raise self._death(rank) from error
-        answers = [self._answer(rank) for rank in range(len(self._connections))]
-        for answer in answers:
-            if isinstance(answer, Exception):
-                raise answer
+        answers: dict[int, Any] = {}
+        while len(answers) < len(self._connections):
+            missing = [rank for rank in range(len(self._connections)) if rank not in answers]
+            self._require_alive(missing)
+            answers |= {rank: self._received(rank) for rank in missing if self._connections[rank].poll(LOOK)}
         state, loss = answers[0]
         return state, loss
 
@@ -74,16 +75,23 @@ class TrainingProcesses:
                 process.join()
         self._folder.cleanup()
 
-    def _answer(self, rank: int) -> Any:
-        """Of one process; all are watched, as one that waits for a dead one would wait for ever."""
-        while not self._connections[rank].poll(LOOK):
-            for number, process in enumerate(self._processes):
-                if not process.is_alive() and not self._connections[number].poll():
-                    raise self._death(number)
+    def _require_alive(self, ranks: Sequence[int]) -> None:
+        """The others would wait for a dead one for ever."""
+        for rank in ranks:
+            if not self._processes[rank].is_alive() and not self._connections[rank].poll():
+                raise self._death(rank)
+
+    def _received(self, rank: int) -> Any:
+        """Raises at once what a process raised: the others may wait for it. A dead one is the reason of all else."""
         try:
-            return self._connections[rank].recv()
+            answer = self._connections[rank].recv()
         except (EOFError, OSError) as error:
             raise self._death(rank) from error
+        if isinstance(answer, Exception):
+            ended = wait([process.sentinel for process in self._processes], LOOK)
+            dead = [number for number, process in enumerate(self._processes) if process.sentinel in ended]
+            raise self._death(dead[0]) if dead else answer
+        return answer
 
     def _death(self, rank: int) -> RuntimeError:
         self._processes[rank].join(ENDING)
