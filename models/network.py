@@ -1,7 +1,7 @@
 """What training, checkpoints and the registry need of a network, whatever its kind."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -48,3 +48,14 @@ class Network(Protocol):
     def load_state_dict(self, state_dict: Mapping[str, Any], /) -> Any: ...
 
     def to(self, device: torch.device | str, /) -> Any: ...
+
+
+@runtime_checkable
+class SemiSupervised(Protocol):
+    """A network that learns from action-free segments beside the labeled ones, where there are any."""
+
+    def semi_supervised_loss(
+        self, labeled: SegmentBatch, action_free: SegmentBatch, generator: torch.Generator
+    ) -> Tensor:
+        """Scalar training loss; the segments of both batches have one length."""
+        ...

@@ -12,7 +12,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from models.network import Network
+from models.network import Network, SemiSupervised
 from models.segments import SegmentBatch
 
 Progress = Callable[[int, int, float], None]
@@ -88,12 +88,14 @@ def train(
     generator: torch.Generator,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
+    action_free: SegmentBatch | None = None,
 ) -> TrainingResult:
     """Trains in place, all steps at once, and leaves the model on `device`.
 
-    Raises NonFiniteError naming step and segments, ValueError for observations outside the model's spaces.
+    action_free: what a SemiSupervised network reads beside the dataset, a minibatch of each a step. Raises
+    NonFiniteError naming step and segments, ValueError for observations outside the model's spaces.
     """
-    state = advance(model, dataset, begin(model, config, generator), config.steps, device, progress)
+    state = advance(model, dataset, begin(model, config, generator), config.steps, device, progress, action_free)
     return TrainingResult(state.step, sum(state.recent) / len(state.recent))
 
 
@@ -112,6 +114,7 @@ def advance(
     until: int,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
+    action_free: SegmentBatch | None = None,
 ) -> TrainingState:
     """Trains from `state` to step `until`; the model, in place, takes the state's weights first.
 
@@ -119,7 +122,7 @@ def advance(
     """
     _check_dataset(model, dataset)
     model.to(device)
-    run = _Run(model, dataset, state, device)
+    run = _Run(model, dataset, state, device, _checked(model, action_free))
     for step in range(state.step, until):
         loss = run.step(step)
         if progress is not None and ((step + 1) % PROGRESS_EVERY == 0 or step + 1 == until):
@@ -144,13 +147,32 @@ def _check_dataset(model: Network, dataset: SegmentBatch) -> None:
     model.check(dataset)
 
 
+def _checked(model: Network, action_free: SegmentBatch | None) -> SegmentBatch | None:
+    """What the model reads beside its dataset, without labels. Raises ValueError for a model that reads nothing."""
+    if action_free is None:
+        return None
+    if not isinstance(model, SemiSupervised):
+        raise ValueError(f"A {model.kind} of the {model.family} family does not learn from action-free segments.")
+    _check_dataset(model, action_free)
+    return action_free.without_labels()
+
+
 class _Run:
     """One slice of training: the model, its optimiser and generator, restored from a state."""
 
-    def __init__(self, model: Network, dataset: SegmentBatch, state: TrainingState, device: torch.device | str) -> None:
+    def __init__(
+        self,
+        model: Network,
+        dataset: SegmentBatch,
+        state: TrainingState,
+        device: torch.device | str,
+        action_free: SegmentBatch | None,
+    ) -> None:
         self.model, self.config, self.device = model, state.config, device
         self.names = dataset.segments
         self.dataset = SegmentBatch(dataset.observations, dataset.actions, dataset.action_sets)
+        self.action_free = action_free
+        self.beside: SegmentBatch | None = None  # the minibatch of it
         model.load_state_dict(_under(state.tensors, "model."))
         self.parameters = dict(model.named_parameters())
         self.optimiser = torch.optim.AdamW(
@@ -168,8 +190,7 @@ class _Run:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.config, step)
         self.optimiser.zero_grad()
-        minibatch = self.dataset.take(indices).to(self.device)  # all of it may be too much for a device
-        loss = self.model.loss(minibatch, self.generator)
+        loss = self._loss(indices)
         value = float(loss.detach())
         self._require_finite("loss", value, step, indices)
         loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it unannotated
@@ -179,6 +200,14 @@ class _Run:
         if step >= self.config.steps - max(1, self.config.steps // 10):
             self.recent.append(value)
         return value
+
+    def _loss(self, indices: Tensor) -> Tensor:
+        batch = self.dataset.take(indices).to(self.device)  # all of it may be too much for a device
+        if self.action_free is None or not isinstance(self.model, SemiSupervised):
+            return self.model.loss(batch, self.generator)
+        rows = torch.randint(self.action_free.size, (len(indices),), generator=self.generator)
+        self.beside = self.action_free.take(rows).to(self.device)
+        return self.model.semi_supervised_loss(batch, self.beside, self.generator)
 
     def state(self, step: int) -> TrainingState:
         """A copy of everything, after `step` steps."""
@@ -199,8 +228,9 @@ class _Run:
 
     def _restore_optimiser(self, saved: dict[str, Tensor]) -> None:
         for name, parameter in self.parameters.items():
-            fields = {field: saved[f"{field}.{name}"] for field in ("step", "exp_avg", "exp_avg_sq") if saved}
-            if fields:
+            keys = {field: f"{field}.{name}" for field in ("step", "exp_avg", "exp_avg_sq")}
+            fields = {field: saved[key] for field, key in keys.items() if key in saved}
+            if fields:  # else no loss has reached the parameter so far
                 self.optimiser.state[parameter] = {
                     key: value.clone().to(parameter.device) for key, value in fields.items()
                 }
@@ -209,6 +239,8 @@ class _Run:
         if math.isfinite(value):
             return
         named = [f"{self.names[i].trajectory}:{self.names[i].start}" for i in indices.tolist()] if self.names else []
+        if self.beside is not None:
+            named += [f"{self.beside.name(row)} (action-free)" for row in range(self.beside.size)]
         which = ", ".join(named) or f"rows {indices.tolist()}"
         raise NonFiniteError(f"The {what} of {self.model.kind} is {value} at step {step}; its segments: {which}.")
 
