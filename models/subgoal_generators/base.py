@@ -1,12 +1,13 @@
 """What every subgoal generator offers."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from models.network import Network
-from models.segments import Observations
+from models.segments import Observations, SegmentBatch
 
 
 class Futures(NamedTuple):
@@ -35,3 +36,23 @@ class SubgoalGenerator(Network, Protocol):
         Samples show what is usual. What is worth executing is rare.
         """
         ...
+
+
+def refuse_actions(batch: SegmentBatch) -> None:
+    """Raises ValueError for a batch that carries actions."""
+    if batch.actions is not None or batch.action_sets is not None:
+        raise ValueError("A subgoal generator never sees actions, but the batch carries them; use without_labels().")
+
+
+def with_idle(observations: Observations, chain: Sequence[Observations], found: Futures, log_prob: float) -> Futures:
+    """The futures with their chains, and of each state one more in which nothing happens."""
+    count = len(next(iter(observations.values())))
+    still = {name: torch.stack([stream] * len(chain), 1) for name, stream in observations.items()}
+    chains = {name: torch.cat((torch.stack([step[name] for step in chain], 1), still[name])) for name in still}
+    every = torch.arange(count, device=found.states.device)
+    return Futures(
+        chains,
+        torch.cat((found.states, every)),
+        torch.cat((found.log_prob, found.log_prob.new_full((count,), log_prob))),
+        torch.cat((found.steady, torch.zeros_like(every, dtype=torch.bool))),
+    )

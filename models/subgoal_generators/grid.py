@@ -1,7 +1,6 @@
 """Subgoal generator of grid worlds: a latent-categorical model of the next observation."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +14,7 @@ from models.networks.mlp import Mlp
 from models.networks.symmetry import DIRECTIONS, turn, turned
 from models.segments import Observations, SegmentBatch, at
 from models.spaces import Spaces
-from models.subgoal_generators.base import Futures
+from models.subgoal_generators.base import Futures, refuse_actions, with_idle
 
 
 @dataclass(frozen=True)
@@ -60,12 +59,12 @@ class GridSubgoalGenerator(nn.Module):
 
     def check(self, batch: SegmentBatch) -> None:
         """Raises ValueError for values outside the vocabulary, or for a batch that carries actions."""
-        _refuse_actions(batch)
+        refuse_actions(batch)
         cells.check(batch.observations)
 
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
         """Mean over transitions of -log p(x'|x, k) - log p(k|x) at each pair's best k."""
-        _refuse_actions(batch)
+        refuse_actions(batch)
         pairs = turned(batch.transitions(), generator).observations
         before, after = at(pairs, 0), at(pairs, 1)
         state: Tensor = self.encoder((before,))
@@ -104,7 +103,7 @@ class GridSubgoalGenerator(nn.Module):
             log_prob = log_prob + likelihood - doubt
             steady = steady & (self._agreeing(chain[-1], codes, following) >= self.config.agreeing)
             chain.append(following)
-        return _with_idle(observations, chain, Futures({}, rows, log_prob, steady), math.log(self.config.idle))
+        return with_idle(observations, chain, Futures({}, rows, log_prob, steady), math.log(self.config.idle))
 
     def _step(self, observations: Observations, codes: Tensor) -> tuple[Observations, Tensor]:
         """The likeliest outcome of codes (M,), and how unsure of it the decoder is: nats (M,)."""
@@ -162,26 +161,7 @@ def _rows(observations: Observations, rows: Tensor) -> Observations:
     return {name: stream[rows] for name, stream in observations.items()}
 
 
-def _with_idle(observations: Observations, chain: Sequence[Observations], found: Futures, log_prob: float) -> Futures:
-    """The futures with their chains, and of each state one more in which nothing happens."""
-    count = len(observations["grid"])
-    still = {name: torch.stack([stream] * len(chain), 1) for name, stream in observations.items()}
-    chains = {name: torch.cat((torch.stack([step[name] for step in chain], 1), still[name])) for name in still}
-    every = torch.arange(count, device=found.states.device)
-    return Futures(
-        chains,
-        torch.cat((found.states, every)),
-        torch.cat((found.log_prob, found.log_prob.new_full((count,), log_prob))),
-        torch.cat((found.steady, torch.zeros_like(every, dtype=torch.bool))),
-    )
-
-
 def _uniform(allowed: Tensor, generator: torch.Generator) -> Tensor:
     """One of the columns allowed in each row: bool (B, K) -> (B,)."""
     draw = torch.rand(allowed.shape, generator=generator, device=generator.device).to(allowed.device)
     return (draw * allowed).argmax(1)
-
-
-def _refuse_actions(batch: SegmentBatch) -> None:
-    if batch.actions is not None or batch.action_sets is not None:
-        raise ValueError("A subgoal generator never sees actions, but the batch carries them; use without_labels().")
