@@ -9,7 +9,10 @@ from torch import Tensor
 
 from models.inverse_dynamics.base import InverseDynamics
 from models.segments import Observations, SegmentBatch, at, first, future
+from models.spaces import BoxAction
 from models.world_models.base import WorldModel
+
+NEAR = 0.1  # of a box's range
 
 
 @dataclass(frozen=True)
@@ -19,7 +22,8 @@ class GroupError:
     next_state_loss: distance of one-step predictions, mean over transitions (grid: nats summed over the observation).
     dynamics_accuracy: changed elements predicted right / changed elements, pooled over transitions.
     exact_accuracy: share of transitions whose likeliest prediction is the whole next observation.
-    inverse_accuracy: share of transitions whose inferred action is in the label's action set.
+    inverse_accuracy: share of transitions whose inferred action is in the label's action set; of actions in a box the
+    share of their numbers that are at most a tenth of the box away from the label's.
     """
 
     transitions: int
@@ -40,7 +44,7 @@ class ModelError:
 @dataclass(frozen=True)
 class TransitionErrors:
     """Per transition (N,): distance, whole next observation predicted right, changed elements predicted right, changed
-    elements, inferred action right."""
+    elements, inferred action right, or how much of it."""
 
     distance: Tensor
     exact: Tensor
@@ -132,6 +136,11 @@ def _recovered(inverse_dynamics: InverseDynamics, pairs: SegmentBatch) -> Tensor
     if pairs.action_sets is not None:
         return pairs.action_sets[:, 0].gather(1, inferred.unsqueeze(1)).squeeze(1)
     actions: Any = pairs.actions
+    space = inverse_dynamics.spaces.action
+    if isinstance(space, BoxAction):
+        near = (inferred - actions[:, 0]).abs() <= NEAR * (space.high - space.low)
+        share: Tensor = near.flatten(1).float().mean(1)
+        return share
     return torch.eq(inferred, actions[:, 0])
 
 

@@ -28,7 +28,7 @@ from torch import Tensor
 from models.acquisition.base import CHUNK, Models, NonFiniteScoreError, given, require
 from models.acquisition.cycle import Cycle
 from models.acquisition.reachability import predicted_chain
-from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.inverse_dynamics.base import ActionProbabilities, DiscreteInverseDynamics
 from models.segments import Observations, SegmentBatch, future
 from models.subgoal_generators.base import Futures
 from models.world_models.base import WorldModel
@@ -95,11 +95,14 @@ def explore(
     """All actions at states x_t (B, ...), each followed by what is inferred along its likeliest future, and scored.
 
     The strategy says whose inverse dynamics infers. after_each: called after each chunk of states, may raise to stop.
-    Raises ValueError when `models` lacks what the strategy needs or a subgoal generator, NonFiniteScoreError.
+    Raises ValueError when `models` lacks what the strategy needs or a subgoal generator and for actions in a box,
+    NonFiniteScoreError.
     """
     require(strategy, models)
     subgoals = given(strategy, "subgoal_generator", models.subgoal_generator)
     world_model, inverse = given(strategy, "world_model", models.world_model), strategy.verifier(models)
+    if not isinstance(inverse, ActionProbabilities):
+        raise ValueError(f"Explore mode tries every action, which {inverse.spaces.action} has too many of.")
     parts = list[_Imagined]()
     for start in range(0, len(next(iter(observations.values()))), chunk):
         states = {name: stream[start : start + chunk] for name, stream in observations.items()}

@@ -6,7 +6,8 @@ from typing import Any, Literal, Protocol
 
 import torch
 
-from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.inverse_dynamics import latent_action, latent_gates
+from models.inverse_dynamics.base import DiscreteInverseDynamics, InverseDynamics
 from models.inverse_dynamics.gates import (
     GridCellMaskedInverseDynamics,
     GridLatentMaskedInverseDynamics,
@@ -18,15 +19,20 @@ from models.inverse_dynamics.grid import (
     GridSparseInverseDynamics,
     SparseInverseDynamicsConfig,
 )
+from models.inverse_dynamics.latent_action import LatentActionConfig, LatentActionInverseDynamics
+from models.inverse_dynamics.latent_gates import LatentGatesConfig, LatentMaskedInverseDynamics
 from models.network import KINDS, Network
 from models.networks.observation import check_spaces as check_robot_spaces
 from models.spaces import BoxAction, DiscreteAction, Spaces, StreamSpec
+from models.subgoal_generators import latent
 from models.subgoal_generators.base import SubgoalGenerator
 from models.subgoal_generators.grid import GridSubgoalGenerator, GridSubgoalGeneratorConfig
+from models.subgoal_generators.latent import LatentSubgoalGenerator, LatentSubgoalGeneratorConfig
 from models.training import TrainingConfig
+from models.world_models import recurrent
 from models.world_models.base import WorldModel
 from models.world_models.grid import GridWorldModel, GridWorldModelConfig
-from models.world_models.recurrent import PAPER, SMALL, RecurrentWorldModel, RecurrentWorldModelConfig
+from models.world_models.recurrent import RecurrentWorldModel, RecurrentWorldModelConfig
 
 __all__ = [
     "FAMILIES",
@@ -60,7 +66,7 @@ class Family(Protocol):
 
     def build_inverse_dynamics(
         self, spaces: Spaces, kind: InverseKind, config: Any, generator: torch.Generator
-    ) -> DiscreteInverseDynamics: ...
+    ) -> InverseDynamics: ...
 
     def build_subgoal_generator(self, spaces: Spaces, config: Any, generator: torch.Generator) -> SubgoalGenerator: ...
 
@@ -168,14 +174,55 @@ class GridFamily:
 
 
 @dataclass(frozen=True)
+class RobotPreset:
+    """What the networks of robots are built and trained by where nothing else is said, kind by kind.
+
+    gates: the inverse dynamics with a learned mask. The dense form is the sparse one without its price.
+    """
+
+    world_model: RecurrentWorldModelConfig
+    latent_action: LatentActionConfig
+    gates: LatentGatesConfig
+    subgoals: LatentSubgoalGeneratorConfig
+    training: Mapping[str, TrainingConfig]
+
+
+_SMALL = RobotPreset(
+    recurrent.SMALL,
+    latent_action.SMALL,
+    latent_gates.SMALL,
+    latent.SMALL,
+    {
+        "world_model": TrainingConfig(1200, 8, 1e-3, 0.0, clip=100.0),
+        "inverse_dynamics": TrainingConfig(1200, 32, 3e-3, 1e-2),
+        "dense_inverse_dynamics": TrainingConfig(1200, 32, 3e-3, 1e-2),
+        "masked_inverse_dynamics": TrainingConfig(1500, 32, 1e-2, 1e-2),
+        "subgoal_generator": TrainingConfig(1500, 64, 3e-3, 1e-4),
+    },
+)
+_PAPER = RobotPreset(
+    recurrent.PAPER,
+    latent_action.PAPER,
+    latent_gates.PAPER,
+    latent.PAPER,
+    {
+        "world_model": TrainingConfig(200_000, 16, 1e-4, 0.0, warm_up=0.0, clip=1000.0, constant=True),
+        "inverse_dynamics": TrainingConfig(200_000, 64, 3e-4, 1e-3, warm_up=0.0, constant=True),
+        "dense_inverse_dynamics": TrainingConfig(200_000, 64, 3e-4, 1e-3, warm_up=0.0, constant=True),
+        "masked_inverse_dynamics": TrainingConfig(50_000, 64, 3e-4, 1e-3, warm_up=0.0, constant=True),
+        "subgoal_generator": TrainingConfig(200_000, 64, 3e-4, 1e-4),
+    },
+)
+
+
+@dataclass(frozen=True)
 class RobotFamily:
     """Robots: camera images and vectors of numbers, actions in a box.
 
-    preset: the world model's config where none is given. small: its training, for hours of two processor cores; the
-    paper's preset trains as the paper does.
+    preset: small, for hours of two processor cores, or the paper's, which trains as the paper does.
     """
 
-    preset: RecurrentWorldModelConfig = SMALL
+    preset: RobotPreset = _SMALL
     name: str = "robot"
 
     def check_spaces(self, spaces: Spaces) -> None:
@@ -186,30 +233,61 @@ class RobotFamily:
         self, spaces: Spaces, config: RecurrentWorldModelConfig | None, generator: torch.Generator
     ) -> RecurrentWorldModel:
         """All parameters are drawn from `generator`."""
-        return RecurrentWorldModel(spaces, config or self.preset, generator)
+        return RecurrentWorldModel(spaces, config or self.preset.world_model, generator)
+
+    def build_inverse_dynamics(
+        self,
+        spaces: Spaces,
+        kind: InverseKind,
+        config: LatentActionConfig | LatentGatesConfig | None,
+        generator: torch.Generator,
+    ) -> InverseDynamics:
+        """All parameters are drawn from `generator`. Raises ValueError for a kind or config that does not fit."""
+        if kind == "masked" and isinstance(config, LatentGatesConfig | None):
+            return LatentMaskedInverseDynamics(spaces, config or self.preset.gates, generator)
+        if isinstance(config, LatentActionConfig | None):
+            config = config or (self.preset.latent_action if kind == "sparse" else self._dense())
+            if (kind == "sparse") == (config.sparsity > 0.0):
+                return LatentActionInverseDynamics(spaces, config, generator)
+        names = "'sparse', 'dense' or 'masked'"
+        raise ValueError(f"Robot inverse dynamics is {names} with its config, got {kind!r} and {config}.")
+
+    def build_subgoal_generator(
+        self, spaces: Spaces, config: LatentSubgoalGeneratorConfig | None, generator: torch.Generator
+    ) -> LatentSubgoalGenerator:
+        """All parameters are drawn from `generator`."""
+        return LatentSubgoalGenerator(spaces, config or self.preset.subgoals, generator)
 
     def build(self, kind: str, spaces: Spaces, config: Mapping[str, Any], generator: torch.Generator) -> Network:
         """Raises ValueError for another kind, TypeError for a config with other fields."""
-        if kind == "world_model":
-            return self.build_world_model(spaces, replace(self.preset, **config), generator)
-        raise ValueError(f"The robot family builds world_model; got {kind!r}.")
+        match kind:
+            case "world_model":
+                return self.build_world_model(spaces, replace(self.preset.world_model, **config), generator)
+            case "inverse_dynamics":
+                sparse = replace(self.preset.latent_action, **config)
+                return self.build_inverse_dynamics(spaces, "sparse", sparse, generator)
+            case "dense_inverse_dynamics":
+                return self.build_inverse_dynamics(spaces, "dense", replace(self._dense(), **config), generator)
+            case "masked_inverse_dynamics":
+                return self.build_inverse_dynamics(spaces, "masked", replace(self.preset.gates, **config), generator)
+            case "subgoal_generator":
+                return self.build_subgoal_generator(spaces, replace(self.preset.subgoals, **config), generator)
+        raise ValueError(f"The robot family builds {', '.join(KINDS)}; got {kind!r}.")
 
     def training_config(self, kind: str, segments: int) -> TrainingConfig:
         """One schedule a kind, the same for every strategy and any number of segments."""
-        if kind == "world_model":
-            return _WORLD_MODEL_TRAINING[self.preset]
-        raise ValueError(f"The robot family trains world_model; got {kind!r}.")
+        if kind not in self.preset.training:
+            raise ValueError(f"The robot family trains {', '.join(KINDS)}; got {kind!r}.")
+        return self.preset.training[kind]
 
+    def _dense(self) -> LatentActionConfig:
+        return replace(self.preset.latent_action, sparsity=0.0)
 
-_WORLD_MODEL_TRAINING = {
-    PAPER: TrainingConfig(200_000, 16, 1e-4, 0.0, warm_up=0.0, clip=1000.0, constant=True),
-    SMALL: TrainingConfig(1200, 8, 1e-3, 0.0, clip=100.0),
-}
 
 GRID = GridFamily()
 ROBOT = RobotFamily()
-ROBOT_PAPER = RobotFamily(PAPER)
-FAMILIES: dict[str, Family] = {GRID.name: GRID}
+ROBOT_PAPER = RobotFamily(_PAPER)
+FAMILIES: dict[str, Family] = {family.name: family for family in (GRID, ROBOT)}
 
 
 def family_named(name: str) -> Family:

@@ -7,7 +7,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import torch
 from torch import Tensor
 
-from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.inverse_dynamics.base import ActionProbabilities, InverseDynamics
 from models.segments import SegmentBatch
 from models.subgoal_generators.base import SubgoalGenerator
 from models.world_models.base import WorldModel
@@ -28,9 +28,9 @@ class Models:
     """The trained networks of a round, as far as it trained them, and the world model of the round before."""
 
     world_model: WorldModel | None = None
-    inverse_dynamics: DiscreteInverseDynamics | None = None
-    dense_inverse_dynamics: DiscreteInverseDynamics | None = None
-    masked_inverse_dynamics: DiscreteInverseDynamics | None = None
+    inverse_dynamics: InverseDynamics | None = None
+    dense_inverse_dynamics: InverseDynamics | None = None
+    masked_inverse_dynamics: InverseDynamics | None = None
     subgoal_generator: SubgoalGenerator | None = None
     previous_world_model: WorldModel | None = None
     ensemble: tuple[WorldModel, ...] = ()
@@ -114,12 +114,12 @@ def require(strategy: Strategy, models: Models) -> None:
 def confidence(strategy: Strategy, models: Models, batch: SegmentBatch, chunk: int = CHUNK) -> Tensor | None:
     """How sure the strategy's inverse dynamics is of the likeliest actions of segments, on the CPU: (B,) in (0, 1].
 
-    The product over the steps. None where the strategy reads no inverse dynamics.
+    The product over the steps. None where the strategy reads no inverse dynamics, or one that says no probabilities.
     """
     inverse = next(
         (getattr(models, name) for name in sorted(strategy.needs) if name.endswith("inverse_dynamics")), None
     )
-    if inverse is None:
+    if not isinstance(inverse, ActionProbabilities):
         return None
     parts = [batch.take(slice(start, start + chunk)) for start in range(0, batch.size, chunk)]
     sure = [inverse.log_prob(part).amax(-1).sum(1).exp().clamp(max=1.0).cpu() for part in parts]

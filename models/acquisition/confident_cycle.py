@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from models.acquisition.base import Models, given
+from models.cycle_consistency import cycle
+from models.inverse_dynamics.base import ActionProbabilities
 from models.segments import SegmentBatch
 from models.step_distances import nearest_actions
 
@@ -17,7 +19,7 @@ class ConfidentCycle:
 
     One action is left where the inverse dynamics is sure, and this is L_cyc. Where it doubts, a distance counts as the
     world model's error only if no plausible action explains the step: the likeliest one alone may be the inverse
-    dynamics' mistake. The actions must be discrete.
+    dynamics' mistake. Inverse dynamics that says no probabilities, over a box, leaves one action too: its own.
     """
 
     name: str = "confident_cycle"
@@ -37,6 +39,9 @@ class ConfidentCycle:
     def _nearest(self, models: Models, batch: SegmentBatch) -> tuple[Tensor, Tensor]:
         """Actions (B, L) and score (B,)."""
         world_model = given(self, "world_model", models.world_model)
-        confidence = given(self, "inverse_dynamics", models.inverse_dynamics).log_prob(batch)  # (B, L, n)
+        inverse = given(self, "inverse_dynamics", models.inverse_dynamics)
+        if not isinstance(inverse, ActionProbabilities):
+            return cycle(world_model, inverse, batch.observations)
+        confidence = inverse.log_prob(batch)  # (B, L, n)
         plausible = (confidence >= math.log(self.least)) | (confidence == confidence.amax(-1, keepdim=True))
         return nearest_actions(world_model, batch.observations, plausible)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from models.acquisition.base import Models, given
 from models.cycle_consistency import cycle_error
-from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.inverse_dynamics.base import InverseDynamics
 from models.segments import SegmentBatch
 
 
@@ -37,7 +37,7 @@ class Cycle:
         world_model = given(self, "world_model", models.world_model)
         return cycle_error(world_model, self.verifier(models), batch.observations)
 
-    def verifier(self, models: Models) -> DiscreteInverseDynamics:
+    def verifier(self, models: Models) -> InverseDynamics:
         """Whose inverse dynamics infers. Raises ValueError where the round has not trained it."""
-        trained: DiscreteInverseDynamics | None = getattr(models, self.inverse)
+        trained: InverseDynamics | None = getattr(models, self.inverse)
         return given(self, self.inverse, trained)

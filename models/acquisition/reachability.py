@@ -6,14 +6,17 @@ import torch
 from torch import Tensor
 
 from models.acquisition.base import InferredActions, Models, given
-from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.inverse_dynamics.base import ActionProbabilities, InverseDynamics
 from models.segments import Observations, SegmentBatch, at, first
 from models.world_models.base import WorldModel
 
 
 @dataclass(frozen=True)
 class Reachability(InferredActions):
-    """-log h(a^ | x_t, x^_{t+1}), summed over steps: x^ is what the world model predicts of the inferred action."""
+    """-log h(a^ | x_t, x^_{t+1}), summed over steps: x^ is what the world model predicts of the inferred action.
+
+    Of actions in a box it is |h(x_t, x^_{t+1}) - a^|^2.
+    """
 
     name: str = "reachability"
     privileged: bool = False
@@ -21,17 +24,19 @@ class Reachability(InferredActions):
 
     @torch.inference_mode()
     def score(self, models: Models, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
-        """(B,) nats. Draws nothing from the generator."""
+        """(B,) nats, or squares of an action's numbers. Draws nothing from the generator."""
         world_model = given(self, "world_model", models.world_model)
         inverse = given(self, "inverse_dynamics", models.inverse_dynamics)
         return unreachability(world_model, inverse, batch.observations, self.actions(models, batch))
 
 
 def unreachability(
-    world_model: WorldModel, inverse: DiscreteInverseDynamics, observations: Observations, actions: Tensor
+    world_model: WorldModel, inverse: InverseDynamics, observations: Observations, actions: Tensor
 ) -> Tensor:
     """How little the inverse dynamics recognises actions (B, L) in what the world model says they lead to -> (B,)."""
     chain = predicted_chain(world_model, observations, actions)
+    if not isinstance(inverse, ActionProbabilities):
+        return (inverse.infer(chain) - actions).square().sum((1, 2))
     log_prob = inverse.log_prob(SegmentBatch(chain))  # (B, L, n)
     return -log_prob.gather(-1, actions.unsqueeze(-1)).squeeze(-1).sum(1)
 

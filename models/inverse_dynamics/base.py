@@ -18,15 +18,14 @@ class ActionInference(Protocol):
 
 
 class InverseDynamics(Network, Protocol):
-    """h_psi: the action between two observations. The loss raises ValueError for a batch without actions."""
+    """h_psi: the action between two observations. The loss raises ValueError for a batch without actions.
+
+    It reads some of an observation's coordinates: its mask M.
+    """
 
     def infer(self, observations: Observations) -> Tensor:
         """Equation 5: observations (B, L+1, ...) -> actions (B, L) or (B, L, D)."""
         ...
-
-
-class DiscreteInverseDynamics(InverseDynamics, Protocol):
-    """Inverse dynamics over a finite set of actions. It reads some of an observation's coordinates: its mask M."""
 
     @property
     def coordinates(self) -> int:
@@ -37,9 +36,18 @@ class DiscreteInverseDynamics(InverseDynamics, Protocol):
         """How many of each first observation's are read: (B, L+1, ...) -> int64 (B,)."""
         ...
 
+
+@runtime_checkable
+class ActionProbabilities(Protocol):
+    """What inverse dynamics over a finite set of actions says, and over a box does not."""
+
     def log_prob(self, batch: SegmentBatch) -> Tensor:
         """log p(a | x_t, x_{t+1}) for every action -> (B, L, n)."""
         ...
+
+
+class DiscreteInverseDynamics(InverseDynamics, ActionProbabilities, Protocol):
+    """Inverse dynamics over a finite set of actions."""
 
 
 @runtime_checkable

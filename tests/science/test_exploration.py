@@ -148,7 +148,8 @@ def test_a_batch_is_shared_out_among_the_actions(models: Models, states: Observa
 
 def test_an_action_that_is_never_inferred_is_proposed_all_the_same(models: Models, states: Observations) -> None:
     """Its label is what would show the inverse dynamics that it explains something."""
-    blind: Any = NeverInfers(CYCLE.verifier(models), TOGGLE)
+    seeing: Any = CYCLE.verifier(models)
+    blind: Any = NeverInfers(seeing, TOGGLE)
     found = explore(CYCLE, replace(models, inverse_dynamics=blind), states, 1, torch.Generator())
     toggles = found.actions[:, 0] == TOGGLE
     works = outcomes(found, states)["grid"].ne(states["grid"][found.states]).flatten(1).any(1)

@@ -11,7 +11,7 @@ from models.acquisition import STRATEGIES, Models, NonFiniteScoreError, Strategy
 from models.acquisition.base import FIRST_ROUND_LACKS
 from models.acquisition.confident_cycle import ConfidentCycle
 from models.families import GRID
-from models.inverse_dynamics.base import DiscreteInverseDynamics
+from models.inverse_dynamics.base import ActionProbabilities, DiscreteInverseDynamics
 from models.network import KINDS
 from models.segments import Observations, SegmentBatch
 from models.training import TrainingConfig, train
@@ -216,7 +216,7 @@ def test_a_doubted_action_is_no_reason_to_ask(models: Models, movement_only: Seg
 
 def test_a_sure_inverse_leaves_the_cycle_error_as_it_is(models: Models, pool: SegmentBatch) -> None:
     sure = models.inverse_dynamics
-    assert sure is not None
+    assert isinstance(sure, ActionProbabilities)
     others = sure.log_prob(pool)[:, 0].sort(1).values[:, -2]  # the second likeliest
     certain = others < math.log(ConfidentCycle.least)
     assert int(certain.sum()) > 20
