@@ -24,7 +24,7 @@ from models.inverse_dynamics.boxes import BoxHead, box_size, check_labels, label
 from models.networks.frame_changes import FrameChanges
 from models.networks.initialisation import initialise, linear, table
 from models.networks.space_time_transformer import SpaceTimeTransformer
-from models.networks.streams import check_finite
+from models.networks.streams import check_finite, parts
 from models.networks.tokens import Tokens
 from models.segments import Observations, SegmentBatch, concatenate
 from models.spaces import Spaces
@@ -112,7 +112,7 @@ class LatentActionInverseDynamics(nn.Module):
 
     def encode(self, observations: Observations) -> Tensor:
         """Latent actions: (B, L+1, ...) -> (B, L, Z). Each depends on no later observation than x_{t+1}."""
-        return self._encode(*self.frames(observations))
+        return torch.cat([self._encode(*self.frames(part)) for part in parts(observations)])
 
     def infer(self, observations: Observations) -> Tensor:
         """Actions (B, L, D) in [-1, 1]."""

@@ -19,7 +19,7 @@ from models.networks.frame_coordinates import FrameCoordinates
 from models.networks.gates import PenaltyRamp, inference_gates, open_probability, sample_gates
 from models.networks.initialisation import initialise, table
 from models.networks.moments import Moments
-from models.networks.streams import check_finite
+from models.networks.streams import check_finite, parts
 from models.segments import Observations, SegmentBatch, concatenate
 from models.spaces import Spaces
 
@@ -79,7 +79,8 @@ class LatentMaskedInverseDynamics(nn.Module):
 
     def infer(self, observations: Observations) -> Tensor:
         """Actions (B, L, D) in [-1, 1]."""
-        return self.head.actions(self._told(self.frame(observations), self.open_gates()))
+        gates = self.open_gates()
+        return torch.cat([self.head.actions(self._told(self.frame(part), gates)) for part in parts(observations)])
 
     @torch.no_grad()
     def open_gates(self) -> Tensor:

@@ -1,6 +1,18 @@
-"""What networks of robots refuse."""
+"""What networks of robots refuse, and how much they look at together."""
 
-from models.segments import SegmentBatch
+from collections.abc import Iterator
+
+from models.segments import Observations, SegmentBatch
+
+FRAMES = 512  # looked at together where no gradient needs them all: bounds memory
+
+
+def parts(observations: Observations) -> Iterator[Observations]:
+    """Segments (B, T, ...) in order, about FRAMES frames at a time."""
+    batch = SegmentBatch(observations)
+    rows = max(1, FRAMES // (batch.length + 1))
+    for start in range(0, max(1, batch.size), rows):
+        yield batch.take(slice(start, start + rows)).observations
 
 
 def check_finite(batch: SegmentBatch) -> None:

@@ -114,6 +114,13 @@ def test_a_latent_action_depends_on_no_later_observation() -> None:
     assert not torch.allclose(before[:, 3], after[:, 3])
 
 
+def test_many_segments_are_read_as_each_alone_is() -> None:
+    model, batch = _built(), toy_point.segments(200, 5, seed=1, together=0.5)
+    with torch.no_grad():
+        alone = model.encode(batch.take(slice(170, 171)).observations)
+        torch.testing.assert_close(model.encode(batch.observations)[170:171], alone)
+
+
 def test_pictures_alone_tell_where_the_point_was_sent() -> None:
     model = _built(replace(CONFIG, patch=4, signs=()), toy_robot.PICTURE)
     generator, labeled = torch.Generator().manual_seed(0), toy_robot.pictures(300, 1, seed=1)
