@@ -194,10 +194,10 @@ _SMALL = RobotPreset(
     latent.SMALL,
     {
         "world_model": TrainingConfig(1200, 8, 1e-3, 0.0, clip=100.0),
-        "inverse_dynamics": TrainingConfig(1200, 32, 3e-3, 1e-2),
-        "dense_inverse_dynamics": TrainingConfig(1200, 32, 3e-3, 1e-2),
-        "masked_inverse_dynamics": TrainingConfig(1500, 32, 1e-2, 1e-2),
-        "subgoal_generator": TrainingConfig(1500, 64, 3e-3, 1e-4),
+        "inverse_dynamics": TrainingConfig(800, 16, 3e-3, 1e-2),
+        "dense_inverse_dynamics": TrainingConfig(800, 16, 3e-3, 1e-2),
+        "masked_inverse_dynamics": TrainingConfig(800, 32, 1e-2, 1e-2),
+        "subgoal_generator": TrainingConfig(1500, 32, 3e-3, 1e-4),
     },
 )
 _PAPER = RobotPreset(

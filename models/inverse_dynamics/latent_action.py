@@ -48,7 +48,7 @@ class LatentActionConfig:
     actor: tuple[int, ...] = (128, 128)
     every: int = 2
     signs: tuple[int, ...] = (-1,)
-    window: int = 8
+    window: int = 5
     width: int = 64
     layers: int = 2
     heads: int = 2
@@ -65,7 +65,7 @@ class LatentActionConfig:
 
 
 SMALL = LatentActionConfig()
-PAPER = LatentActionConfig(actor=(1024, 1024, 1024), width=256, layers=3, heads=4, hidden=2048)
+PAPER = LatentActionConfig(actor=(1024, 1024, 1024), window=8, width=256, layers=3, heads=4, hidden=2048)
 """The reference's sizes; three layers that look one frame back each see its three frames."""
 
 

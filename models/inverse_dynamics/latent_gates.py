@@ -40,7 +40,7 @@ class LatentGatesConfig:
     signs: tuple[int, ...] = (-1,)
     latent: int = 32
     depth: int = 8
-    window: int = 8
+    window: int = 4
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))  # JSON has lists
@@ -48,7 +48,7 @@ class LatentGatesConfig:
 
 
 SMALL = LatentGatesConfig()
-PAPER = LatentGatesConfig(free=2000, ramp=8000, hidden=(1024, 1024, 1024), latent=64, depth=32)
+PAPER = LatentGatesConfig(free=2000, ramp=8000, hidden=(1024, 1024, 1024), latent=64, depth=32, window=8)
 
 
 class LatentMaskedInverseDynamics(nn.Module):

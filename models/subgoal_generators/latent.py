@@ -42,7 +42,7 @@ class LatentSubgoalGeneratorConfig:
     depth: int = 8
     hidden: tuple[int, ...] = (256, 256)
     steps: int = 12
-    window: int = 8
+    window: int = 4
     forget: float = 0.5
     blur: float = 0.1
     futures: int = 8
@@ -55,7 +55,7 @@ class LatentSubgoalGeneratorConfig:
 
 
 SMALL = LatentSubgoalGeneratorConfig()
-PAPER = LatentSubgoalGeneratorConfig(latent=128, depth=32, hidden=(1024, 1024, 1024))
+PAPER = LatentSubgoalGeneratorConfig(latent=128, depth=32, hidden=(1024, 1024, 1024), window=8)
 
 
 class LatentSubgoalGenerator(nn.Module):

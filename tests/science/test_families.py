@@ -60,7 +60,7 @@ def test_the_paper_s_robot_preset_has_the_stated_sizes() -> None:
     sparse = build(toy_point.SPACES, "sparse", None, generator).config
     assert (sparse.latent, sparse.sparsity, sparse.actor, sparse.every) == (16, 0.1, (1024, 1024, 1024), 2)
     assert build(toy_point.SPACES, "dense", None, generator).config == LatentActionConfig(
-        sparsity=0.0, actor=(1024, 1024, 1024), width=256, layers=3, heads=4, hidden=2048
+        sparsity=0.0, actor=(1024, 1024, 1024), window=8, width=256, layers=3, heads=4, hidden=2048
     )
 
 
