@@ -179,7 +179,7 @@ def test_a_clock_that_is_wrong(well: Served) -> None:
 
 
 def test_a_folder_that_is_gone(well: Served) -> None:
-    (well.settings.data_folder / "provenance").rmdir()
+    shutil.rmtree(well.settings.data_folder / "provenance")
     assert "provenance is not there" in told(well)
     assert not (well.settings.data_folder / "provenance").exists()  # it looks and changes nothing
 
