@@ -161,12 +161,17 @@ class Served:
     def events(self, project: str) -> list[Json]:
         """All events of a project; on PostgreSQL the last are shown once no older transaction is open on the server."""
         newest = self.get("/events", project=project, newest=True, limit=1)["items"][0]["id"]
+        items: list[Json] = self.events_up_to(project, newest, limit=1000)["items"]
+        return items
+
+    def events_up_to(self, project: str, last: int, **query: Any) -> Json:
+        """A page of a project's events, once it lists that one: other tests on the server have transactions, too."""
         deadline = time.monotonic() + 20
         while True:
-            items: list[Json] = self.get("/events", project=project, limit=1000)["items"]
-            if newest in [item["id"] for item in items]:
-                return items
-            assert time.monotonic() < deadline, f"event {newest} is not listed"
+            page = self.get("/events", project=project, **query)
+            if last in [item["id"] for item in page["items"]]:
+                return page
+            assert time.monotonic() < deadline, f"event {last} is not listed"
             time.sleep(0.02)
 
     def close(self) -> None:
