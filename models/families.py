@@ -37,6 +37,7 @@ from models.world_models.recurrent import RecurrentWorldModel, RecurrentWorldMod
 __all__ = [
     "FAMILIES",
     "GRID",
+    "PRESETS",
     "ROBOT",
     "ROBOT_PAPER",
     "BoxAction",
@@ -76,6 +77,13 @@ class Family(Protocol):
 
     def training_config(self, kind: str, segments: int) -> TrainingConfig:
         """The default schedule for `kind` on that many segments. Raises ValueError for an unknown kind."""
+        ...
+
+    def further_config(self, kind: str, segments: int) -> TrainingConfig | None:
+        """The schedule from the weights of the round before; None: every round trains `kind` from scratch.
+
+        Raises ValueError for an unknown kind.
+        """
         ...
 
 
@@ -172,12 +180,17 @@ class GridFamily:
                 return TrainingConfig(steps=1500, batch_size=64, learning_rate=5e-3, weight_decay=1e-4)
         raise ValueError(f"The grid family trains {', '.join(KINDS)}; got {kind!r}.")
 
+    def further_config(self, kind: str, segments: int) -> None:
+        """From scratch, so that a round's models depend on its labels alone and not on how they came in."""
+        self.training_config(kind, segments)  # refuses an unknown kind
+
 
 @dataclass(frozen=True)
 class RobotPreset:
     """What the networks of robots are built and trained by where nothing else is said, kind by kind.
 
-    gates: the inverse dynamics with a learned mask. The dense form is the sparse one without its price.
+    gates: the inverse dynamics with a learned mask. The dense form is the sparse one without its price. further: the
+    schedules of later rounds, from the weights of the round before.
     """
 
     world_model: RecurrentWorldModelConfig
@@ -185,6 +198,7 @@ class RobotPreset:
     gates: LatentGatesConfig
     subgoals: LatentSubgoalGeneratorConfig
     training: Mapping[str, TrainingConfig]
+    further: Mapping[str, TrainingConfig]
 
 
 _SMALL = RobotPreset(
@@ -199,6 +213,13 @@ _SMALL = RobotPreset(
         "masked_inverse_dynamics": TrainingConfig(800, 32, 1e-2, 1e-2),
         "subgoal_generator": TrainingConfig(1500, 32, 3e-3, 1e-4),
     },
+    {
+        "world_model": TrainingConfig(400, 8, 5e-4, 0.0, clip=100.0),
+        "inverse_dynamics": TrainingConfig(270, 16, 1e-3, 1e-2),
+        "dense_inverse_dynamics": TrainingConfig(270, 16, 1e-3, 1e-2),
+        "masked_inverse_dynamics": TrainingConfig(270, 32, 3e-3, 1e-2),
+        "subgoal_generator": TrainingConfig(500, 32, 1e-3, 1e-4),
+    },
 )
 _PAPER = RobotPreset(
     recurrent.PAPER,
@@ -211,6 +232,13 @@ _PAPER = RobotPreset(
         "dense_inverse_dynamics": TrainingConfig(200_000, 64, 3e-4, 1e-3, warm_up=0.0, constant=True),
         "masked_inverse_dynamics": TrainingConfig(50_000, 64, 3e-4, 1e-3, warm_up=0.0, constant=True),
         "subgoal_generator": TrainingConfig(200_000, 64, 3e-4, 1e-4),
+    },
+    {
+        "world_model": TrainingConfig(50_000, 16, 1e-4, 0.0, warm_up=0.0, clip=1000.0, constant=True),
+        "inverse_dynamics": TrainingConfig(50_000, 64, 3e-4, 1e-3, warm_up=0.0, constant=True),
+        "dense_inverse_dynamics": TrainingConfig(50_000, 64, 3e-4, 1e-3, warm_up=0.0, constant=True),
+        "masked_inverse_dynamics": TrainingConfig(50_000, 64, 3e-4, 1e-3, warm_up=0.0, constant=True),
+        "subgoal_generator": TrainingConfig(50_000, 64, 3e-4, 1e-4),
     },
 )
 
@@ -276,9 +304,17 @@ class RobotFamily:
 
     def training_config(self, kind: str, segments: int) -> TrainingConfig:
         """One schedule a kind, the same for every strategy and any number of segments."""
-        if kind not in self.preset.training:
+        return self._of(self.preset.training, kind)
+
+    def further_config(self, kind: str, segments: int) -> TrainingConfig:
+        """A shorter schedule, as in the paper: every round adds to what the one before has learned."""
+        return self._of(self.preset.further, kind)
+
+    @staticmethod
+    def _of(schedules: Mapping[str, TrainingConfig], kind: str) -> TrainingConfig:
+        if kind not in schedules:
             raise ValueError(f"The robot family trains {', '.join(KINDS)}; got {kind!r}.")
-        return self.preset.training[kind]
+        return schedules[kind]
 
     def _dense(self) -> LatentActionConfig:
         return replace(self.preset.latent_action, sparsity=0.0)
@@ -288,10 +324,19 @@ GRID = GridFamily()
 ROBOT = RobotFamily()
 ROBOT_PAPER = RobotFamily(_PAPER)
 FAMILIES: dict[str, Family] = {family.name: family for family in (GRID, ROBOT)}
+PRESETS: dict[str, dict[str, Family]] = {"robot": {"small": ROBOT, "paper": ROBOT_PAPER}}  # its default is the first
 
 
-def family_named(name: str) -> Family:
-    """Raises ValueError, in a sentence, for a name that is not in FAMILIES."""
+def family_named(name: str, preset: str | None = None) -> Family:
+    """The family in its default preset or in another; a preset says only what new networks are built and trained by.
+
+    Raises ValueError, in a sentence, for a name that is not in FAMILIES or a preset that the family does not have.
+    """
     if name not in FAMILIES:
         raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {name!r}.")
-    return FAMILIES[name]
+    if preset is None:
+        return FAMILIES[name]
+    known = PRESETS.get(name, {})
+    if preset not in known:
+        raise ValueError(f"preset of the {name} family must be one of {', '.join(known) or 'none'}, got {preset!r}.")
+    return known[preset]

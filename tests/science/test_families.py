@@ -19,13 +19,27 @@ def test_an_unknown_family_is_named_with_those_there_are() -> None:
         family_named("gird")
 
 
+def test_a_preset_is_another_size_of_the_same_family() -> None:
+    small, paper = family_named("robot", "small"), family_named("robot", "paper")
+    assert (small, paper) == (ROBOT, ROBOT_PAPER)
+    assert small.name == paper.name
+    with pytest.raises(ValueError, match="preset of the robot family must be one of small, paper, got 'huge'"):
+        family_named("robot", "huge")
+    with pytest.raises(ValueError, match="preset of the grid family must be one of none, got 'small'"):
+        family_named("grid", "small")
+
+
 @pytest.mark.parametrize("name", FAMILIES)
 def test_a_family_builds_and_schedules_every_kind(name: str) -> None:
     family = family_named(name)
     for kind in KINDS:
         network = family.build(kind, SPACES[name], {}, torch.Generator().manual_seed(0))
         assert (network.family, network.kind) == (name, kind)
-        assert family.training_config(kind, 500).steps > 0
+        steps = family.training_config(kind, 500).steps
+        further = family.further_config(kind, 500)
+        assert steps > 0
+        assert (further is None) == (name == "grid")
+        assert further is None or further.steps < steps
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -34,6 +48,8 @@ def test_unknown_kinds_are_refused(name: str) -> None:
         family_named(name).build("critic", SPACES[name], {}, torch.Generator())
     with pytest.raises(ValueError, match="got 'critic'"):
         family_named(name).training_config("critic", 500)
+    with pytest.raises(ValueError, match="got 'critic'"):
+        family_named(name).further_config("critic", 500)
 
 
 @pytest.mark.parametrize("spaces", [toy_grid.SPACES, Spaces(toy_grid.SPACES.observations, BoxAction(-1.0, 1.0, (7,)))])
