@@ -74,12 +74,23 @@ class DiscreteActions(Schema):
 
 
 class BoxActions(Schema):
-    """Vectors of `shape` between `low` and `high`, in every coordinate."""
+    """Vectors of `shape` between `low` and `high`, in every coordinate.
+
+    signs: coordinates of a vector of which only the side of the middle counts, as of a gripper that opens or closes.
+    """
 
     kind: Literal["box"] = "box"
     shape: Annotated[Shape, _at_most(MOST_COORDINATES)]
     low: Number = -1.0
     high: Number = 1.0
+    signs: Annotated[tuple[Integer, ...], Field(max_length=MOST_COORDINATES, fail_fast=True)] = ()
+
+    @model_validator(mode="after")
+    def _signs_are_coordinates(self) -> "BoxActions":
+        wrong = [place for place in self.signs if len(self.shape) != 1 or not 0 <= place < self.shape[0]]
+        if wrong:
+            raise ValueError(f"signs: {wrong[0]} is no coordinate of a vector of shape {self.shape}")
+        return self
 
 
 Actions = Annotated[DiscreteActions | BoxActions, Field(discriminator="kind")]
@@ -132,6 +143,24 @@ def takes_grid(spaces: Spaces) -> bool:
     return square and bytes_only and isinstance(spaces.actions, DiscreteActions)
 
 
+def takes_robot(spaces: Spaces) -> bool:
+    """Whether the robot family takes the spaces: square images of one size, vectors of floats, a bounded box of
+    vectors as actions. A contract test holds it equal to what the family says itself."""
+    action, streams = spaces.actions, spaces.observations.values()
+    images = {(stream.dtype, stream.shape) for stream in streams if len(stream.shape) == 3}
+    vectors = all(
+        len(stream.shape) == 1 and stream.dtype.startswith("float") for stream in streams if len(stream.shape) != 3
+    )
+    box = isinstance(action, BoxActions) and len(action.shape) == 1 and action.low < action.high
+    return box and vectors and len(images) <= 1 and all(_is_camera(*image) for image in images)
+
+
+def _is_camera(dtype: str, shape: tuple[int, ...]) -> bool:
+    """Bytes of three colours whose side is a power of two, 8 or more."""
+    side = shape[0]
+    return dtype == "uint8" and shape == (side, side, 3) and side >= 8 and side & (side - 1) == 0
+
+
 def bounded_grid(spaces: Spaces) -> Spaces:
     """The same spaces with the grid family's largest values on every stream."""
     streams = {name: stream.model_copy(update={"high": GRID_HIGH}) for name, stream in spaces.observations.items()}
@@ -173,6 +202,7 @@ class ManiSkillOptions(RobotOptions):
 
 IMAGE_SHAPE = (64, 64, 3)
 POSE = 9  # numbers: a position, and two columns of a rotation matrix
+GRIPPER = 6  # the coordinate of an action that opens or closes it
 ROBOT_OBJECTS = {
     "Lift": 1,
     "PickPlaceCan": 1,
@@ -202,7 +232,7 @@ def _robot_spaces(task: str, cameras: bool) -> Spaces:
         seen = {name: Stream(dtype="uint8", shape=IMAGE_SHAPE) for name in ("front", "wrist")}
     else:
         seen = {"objects": Stream(dtype="float32", shape=(POSE * ROBOT_OBJECTS[task],))}
-    return Spaces(observations={**seen, "proprioception": arm}, actions=BoxActions(shape=(7,)))
+    return Spaces(observations={**seen, "proprioception": arm}, actions=BoxActions(shape=(7,), signs=(GRIPPER,)))
 
 
 SIMULATOR_BEHAVIORS: dict[str, tuple[str, ...]] = {

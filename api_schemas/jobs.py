@@ -39,11 +39,13 @@ class TrainRound(Schema):
     """Train the networks of a round that `strategy` needs, evaluate, then ask for the scoring of `strategy`.
 
     What the round has already is not trained again, so the same job adds a second strategy's networks to a round.
+    memberships: networks that learn from action-free data too read the pool's members up to this id; None: all of them.
     """
 
     kind: Literal["train_round"] = "train_round"
     round: UUID
     strategy: StrategyName
+    memberships: int | None = None
 
 
 class TrainSubgoalGenerator(Schema):

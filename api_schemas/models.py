@@ -16,7 +16,10 @@ ModelKind = Literal[
 
 
 class ModelVersion(Schema):
-    """A trained network: weights by hash, its whole config, the labels it saw. `member` counts within an ensemble."""
+    """A trained network: weights by hash, its whole config, the labels it saw. `member` counts within an ensemble.
+
+    parent: the network of an earlier round from whose weights its training began; None where it began from scratch.
+    """
 
     id: UUID
     project: UUID
@@ -29,4 +32,5 @@ class ModelVersion(Schema):
     bytes: int
     watermark: int
     metrics: dict[str, float]
+    parent: UUID | None = None
     created_at: Timestamp

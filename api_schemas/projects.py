@@ -6,10 +6,12 @@ from uuid import UUID
 from pydantic import Field, model_validator
 
 from api_schemas.base import AS_JSON, Natural, Number, Positive, Schema, Seed, Timestamp
-from api_schemas.environments import Environment, Spaces, bounded_grid, takes_grid
+from api_schemas.environments import Environment, Spaces, bounded_grid, takes_grid, takes_robot
 from api_schemas.strategies import DEFAULT_BATCH_RULE, DEFAULT_STRATEGY, BatchRuleName, StrategyName
 
-Family = Literal["grid"]
+Family = Literal["grid", "robot"]
+Preset = Literal["small", "paper"]
+DEFAULT_PRESET: Preset = "small"
 Steps = Annotated[int, Field(ge=1, le=1_000_000), AS_JSON]
 
 
@@ -35,6 +37,9 @@ class ProjectCreate(Schema):
     name: str = Field(min_length=1, max_length=80, pattern=r"^[^\s/\x00-\x1f](?:[^/\x00-\x1f]*[^\s/\x00-\x1f])?$")
     environment: Environment
     family: Family | None = Field(default=None, description="default: the one that takes the spaces, if any does")
+    preset: Preset | None = Field(
+        default=None, description=f"size of the robot family's networks and of their training; default {DEFAULT_PRESET}"
+    )
     segment_length: Steps = 1
     stride: Steps | None = Field(default=None, description="default: segment_length")
     held_out_fraction: Number = Field(default=0.1, ge=0, lt=1)
@@ -51,6 +56,8 @@ class ProjectCreate(Schema):
     def _family_takes_the_spaces(self) -> "ProjectCreate":
         if self.family is not None and self.resolved_family() != self.family:
             raise ValueError(f"family: {self.family!r} does not take these spaces")
+        if self.preset is not None and self.resolved_family() != "robot":
+            raise ValueError(f"preset: {self.preset!r} is for the robot family, which does not take these spaces")
         return self
 
     def resolved_spaces(self) -> Spaces:
@@ -60,7 +67,14 @@ class ProjectCreate(Schema):
 
     def resolved_family(self) -> Family | None:
         """The model family that takes the spaces; without one a project holds data and labels but trains nothing."""
-        return "grid" if takes_grid(self.environment.resolved_spaces()) else None
+        spaces = self.environment.resolved_spaces()
+        if takes_grid(spaces):
+            return "grid"
+        return "robot" if takes_robot(spaces) else None
+
+    def resolved_preset(self) -> Preset | None:
+        """The preset of the family; None where it has but one."""
+        return (self.preset or DEFAULT_PRESET) if self.resolved_family() == "robot" else None
 
 
 class ProjectPatch(Schema):
@@ -102,6 +116,7 @@ class Project(Schema):
     name: str
     environment: Environment
     family: Family | None
+    preset: Preset | None = None
     segment_length: int
     stride: int
     held_out_fraction: float

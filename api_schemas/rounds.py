@@ -17,10 +17,13 @@ class RoundCreate(Schema):
 class ModelError(Schema):
     """Error on the project's labeled held-out segments.
 
-    loss: next-state loss, summed nats a transition. exact_accuracy: share of transitions whose whole next observation
-    is predicted right; None in rounds from before it was measured. dynamics_accuracy: share of changed elements
-    that are predicted right. by_group: the same by action group (movement, interaction). inverse_accuracy counts an
-    action as right when it is among those that explain the step. None: no such transition in the held-out set.
+    loss: of grids the next-state loss, summed nats a transition; of robots the share of what changes that open-loop
+    predictions of whole segments do not foresee, 1 where they are no better than standing still. exact_accuracy: share
+    of transitions whose whole next observation is predicted right; None of robots, and in rounds from before it was
+    measured. dynamics_accuracy: share of changed elements that are predicted right. by_group: the same by action group
+    (movement, interaction). inverse_accuracy counts an action as right when it is among those that explain the step;
+    of actions in a box, those of their numbers that are at most a tenth of the box away. open_loop: of robots, errors
+    by horizon. None: no such transition in the held-out set.
     """
 
     transitions: int
@@ -29,6 +32,7 @@ class ModelError(Schema):
     dynamics_accuracy: float | None
     inverse_accuracy: float | None
     by_group: dict[str, "GroupError"] = {}
+    open_loop: list["OpenLoopError"] = []
 
 
 class GroupError(Schema):
@@ -39,6 +43,18 @@ class GroupError(Schema):
     exact_accuracy: float | None = None
     dynamics_accuracy: float | None
     inverse_accuracy: float | None
+
+
+class OpenLoopError(Schema):
+    """Squared errors up to `horizon` steps after the last observation that the world model saw, by stream.
+
+    Means over segments, steps and coordinates; of images in [0, 1], so theirs is the per-pixel error. standing_still:
+    the same of a prediction that nothing moves.
+    """
+
+    horizon: int
+    errors: dict[str, float]
+    standing_still: dict[str, float]
 
 
 class Mask(Schema):

@@ -33,20 +33,28 @@ class Strategy(Schema):
     """`privileged` strategies see hidden actions: benchmarks only, a project is refused them.
 
     `needs` names the networks that it reads: the round trains them, but for the previous round's world model.
-    explores: it proposes what to execute in explore mode; for the others chance does.
+    explores: it proposes what to execute in explore mode; for the others chance does. boxes: it takes actions in a box;
+    what tries every action does not.
     """
 
     name: StrategyName
     privileged: bool
     needs: tuple[str, ...]
     explores: bool = False
+    boxes: bool = True
     summary: str
 
 
 def _strategy(
-    name: StrategyName, needs: tuple[str, ...], summary: str, *, privileged: bool = False, explores: bool = False
+    name: StrategyName,
+    needs: tuple[str, ...],
+    summary: str,
+    *,
+    privileged: bool = False,
+    explores: bool = False,
+    boxes: bool = True,
 ) -> Strategy:
-    return Strategy(name=name, privileged=privileged, needs=needs, explores=explores, summary=summary)
+    return Strategy(name=name, privileged=privileged, needs=needs, explores=explores, boxes=boxes, summary=summary)
 
 
 _CYCLE = ("inverse_dynamics", "world_model")
@@ -73,7 +81,12 @@ CATALOG: tuple[Strategy, ...] = (
         "The same cycle error under an inverse model that sees the whole observation.",
         explores=True,
     ),
-    _strategy("self_inverse", ("world_model",), "Cycle error with the world model as its own inverse: a control."),
+    _strategy(
+        "self_inverse",
+        ("world_model",),
+        "Cycle error with the world model as its own inverse: a control.",
+        boxes=False,
+    ),
     _strategy(
         "uncertainty",
         ("ensemble", "inverse_dynamics"),
@@ -92,7 +105,12 @@ CATALOG: tuple[Strategy, ...] = (
     _strategy(
         "reachability", _CYCLE, "How little the inverse model recognises the action in what it is predicted to do."
     ),
-    _strategy("forward_cycle", _CYCLE, "The forward-first cycle: predict under every action, then recover the action."),
+    _strategy(
+        "forward_cycle",
+        _CYCLE,
+        "The forward-first cycle: predict under every action, then recover the action.",
+        boxes=False,
+    ),
     _strategy(
         "true_progress",
         ("previous_world_model", "world_model"),
@@ -103,4 +121,5 @@ CATALOG: tuple[Strategy, ...] = (
     _strategy("oracle_easy", ("world_model",), "The true loss, easiest first.", privileged=True),
     _strategy("oracle_uniform", ("world_model",), "Ten intervals of the true loss by turns.", privileged=True),
 )
+TRY_EVERY_ACTION: frozenset[str] = frozenset(strategy.name for strategy in CATALOG if not strategy.boxes)
 PRIVILEGED: frozenset[str] = frozenset(strategy.name for strategy in CATALOG if strategy.privileged)

@@ -12,7 +12,13 @@ import torch
 from torch import Tensor
 
 from models.cycle_consistency import cycle
-from models.inverse_dynamics.base import DiscreteInverseDynamics, VerifyingBlock
+from models.evaluation import recovered
+from models.inverse_dynamics.base import (
+    ActionProbabilities,
+    DiscreteInverseDynamics,
+    InverseDynamics,
+    VerifyingBlock,
+)
 from models.rank_correlation import kendall, spearman
 from models.segments import SegmentBatch
 from models.spaces import DiscreteAction
@@ -91,6 +97,8 @@ class KnownAction:
 class Diagnostics:
     """Of one round. sampled: pool segments that were looked at; what needs labels or segments that lack is None.
 
+    Of actions in a box there are the mask and the ranking: the others compare symbols, or count actions.
+
     back_action_in_support: over the steps whose z_S some label shows. There a rise is the rest's doing alone; over all
     steps the kinds of steps that the labels lack may lie near or far themselves.
     """
@@ -108,7 +116,7 @@ class Diagnostics:
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """Over held-out segments: score (B,), true loss (B,), inferred action is among those that explain (B, L)."""
+    """Over held-out segments: score (B,), true loss (B,), inferred action is right, or how much of it (B, L)."""
 
     score: Tensor
     loss: Tensor
@@ -118,7 +126,7 @@ class _HeldOut:
 @torch.inference_mode()
 def diagnose(
     world_model: WorldModel,
-    inverse_dynamics: DiscreteInverseDynamics,
+    inverse_dynamics: InverseDynamics,
     labeled: SegmentBatch,
     pool: SegmentBatch | None,
     held_out: SegmentBatch | None,
@@ -129,20 +137,23 @@ def diagnose(
 
     labeled: what the round trained on. pool: a sample of the unlabeled segments. held_out: labeled held-out segments.
     groups: name -> actions; a segment belongs to those that any of its actions is in. Raises ValueError for labeled
-    or held-out segments without actions, for an action space that is not discrete, and for a score or loss that is not
-    finite, naming its segment.
+    or held-out segments without actions, and for a score or loss that is not finite, naming its segment.
     """
     held = None if held_out is None else _held_out(world_model, inverse_dynamics, held_out, after_each)
+    sampled, mask = 0 if pool is None else pool.size, None if pool is None else _mask(inverse_dynamics, pool)
+    ranking = None if held is None else _ranking(held.score, held.loss)
+    if not isinstance(inverse_dynamics, ActionProbabilities):
+        return Diagnostics(sampled, mask, None, None, None, None, ranking, {}, ())
     members = {} if held_out is None else {name: _in_group(held_out, actions) for name, actions in groups.items()}
     back_action, in_support = _back_action(inverse_dynamics, labeled, held_out, held, after_each)
     return Diagnostics(
-        sampled=0 if pool is None else pool.size,
-        mask=None if pool is None else _mask(inverse_dynamics, pool),
+        sampled=sampled,
+        mask=mask,
         support=None if pool is None else _support(inverse_dynamics, labeled, pool, after_each),
         aliasing=None if pool is None else _aliasing(inverse_dynamics, pool, after_each),
         back_action=back_action,
         back_action_in_support=in_support,
-        ranking=None if held is None else _ranking(held.score, held.loss),
+        ranking=ranking,
         ranking_by_group={}
         if held is None
         else {name: _ranking(held.score[chosen], held.loss[chosen]) for name, chosen in members.items()},
@@ -184,7 +195,7 @@ def known_actions(labels: Tensor, held_out: Tensor | None, right: Tensor | None)
     )
 
 
-def _mask(inverse_dynamics: DiscreteInverseDynamics, pool: SegmentBatch) -> Mask:
+def _mask(inverse_dynamics: InverseDynamics, pool: SegmentBatch) -> Mask:
     kept = torch.cat([inverse_dynamics.kept(part.observations) for part in _chunks(pool)])
     return Mask(float(kept.double().mean()), inverse_dynamics.coordinates)
 
@@ -238,13 +249,12 @@ def _error_by_distance(distance: Tensor, wrong: Tensor) -> BackAction | None:
 
 
 def _held_out(
-    world_model: WorldModel, inverse_dynamics: DiscreteInverseDynamics, held_out: SegmentBatch, after_each: AfterEach
+    world_model: WorldModel, inverse_dynamics: InverseDynamics, held_out: SegmentBatch, after_each: AfterEach
 ) -> _HeldOut:
     parts = []
     for part in _chunks(held_out):
-        sets = explanations(inverse_dynamics, part)
         inferred, score = cycle(world_model, inverse_dynamics, part.observations)
-        right = sets.gather(2, inferred.unsqueeze(2)).squeeze(2)
+        right = recovered(inverse_dynamics, part, inferred)
         loss = nearest_true_actions(world_model, part)[1]
         _require_finite(part, score, loss)
         parts.append((score, loss, right))

@@ -15,10 +15,13 @@ them, and of which the world model is not sure: p(x^_a) is what it gives to its 
 give if it were certain. h(a) is how often a is inferred at all, and of futures each h is at least about `UNNAMED`: an
 action that no label shows is never inferred, so else never executed, so never labeled.
 
+Where actions are a box nobody tries every one: there Algorithm 1 is taken as it is, and a state is worth the error of
+the worst of its chains.
+
 The batch is a matter of the queue (`exploration_queue`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
@@ -28,13 +31,18 @@ from torch import Tensor
 from models.acquisition.base import CHUNK, Models, NonFiniteScoreError, given, require
 from models.acquisition.cycle import Cycle
 from models.acquisition.reachability import predicted_chain
+from models.cycle_consistency import WorstChain, worst_chain
 from models.inverse_dynamics.base import ActionProbabilities, DiscreteInverseDynamics
 from models.segments import Observations, SegmentBatch, future
+from models.spaces import BoxAction, DiscreteAction
 from models.subgoal_generators.base import Futures
 from models.world_models.base import WorldModel
 
 STATES = 4000
 """Drawn of the pool each time: what is worth executing is at many states, so looking at more of them hardly helps."""
+
+CHAINS = 8  # of a state, where actions are a box
+IMAGINED = 100_000  # observations in all of them, at most: of robots each is a picture
 
 Asked = tuple[bytes, tuple[object, ...]]  # what it looks like there, and the actions
 
@@ -46,7 +54,8 @@ FIDELITY = 0.3  # against the cycle error: what is wrong about a step that chang
 
 @dataclass(frozen=True)
 class Explorations:
-    """M of them. states int64 (M,): the rows they begin at. actions int64 (M, K): to be executed. scores (M,), nats."""
+    """M of them. states int64 (M,): the rows they begin at. actions int64 (M, K) or float (M, K, D): to be executed.
+    scores (M,), nats."""
 
     states: Tensor
     actions: Tensor
@@ -94,18 +103,21 @@ def explore(
 ) -> Explorations:
     """All actions at states x_t (B, ...), each followed by what is inferred along its likeliest future, and scored.
 
-    The strategy says whose inverse dynamics infers. after_each: called after each chunk of states, may raise to stop.
-    Raises ValueError when `models` lacks what the strategy needs or a subgoal generator and for actions in a box,
-    NonFiniteScoreError.
+    Of actions in a box those inferred along the worst of CHAINS sampled chains. The strategy says whose inverse
+    dynamics infers. after_each: called after each chunk of states, may raise to stop. Raises ValueError when `models`
+    lacks what the strategy needs or a subgoal generator, NonFiniteScoreError.
     """
     require(strategy, models)
     subgoals = given(strategy, "subgoal_generator", models.subgoal_generator)
     world_model, inverse = given(strategy, "world_model", models.world_model), strategy.verifier(models)
     if not isinstance(inverse, ActionProbabilities):
-        raise ValueError(f"Explore mode tries every action, which {inverse.spaces.action} has too many of.")
+        worst = list[WorstChain]()
+        for states in _parts(observations, chunk):
+            worst.append(worst_chain(world_model, inverse, subgoals, states, CHAINS, horizon, generator))
+            after_each()
+        return _checked(strategy, _worst(worst))
     parts = list[_Imagined]()
-    for start in range(0, len(next(iter(observations.values()))), chunk):
-        states = {name: stream[start : start + chunk] for name, stream in observations.items()}
+    for states in _parts(observations, chunk):
         futures = subgoals.futures(states, horizon, generator)
         parts.append(_Imagined(states, futures, inverse.log_prob(SegmentBatch(futures.chains))))
         after_each()
@@ -115,7 +127,28 @@ def explore(
         actions.append(_candidates(part))
         scores.append(_scores(world_model, inverse, part, actions[-1], usual))
         after_each()
-    found = _listed(torch.cat(actions), torch.cat(scores))
+    return _checked(strategy, _listed(torch.cat(actions), torch.cat(scores)))
+
+
+def states_to_look_at(space: DiscreteAction | BoxAction, horizon: int) -> int:
+    """How many to draw of the pool: STATES, or as many as have no more than IMAGINED observations in their chains."""
+    return STATES if isinstance(space, DiscreteAction) else max(1, min(STATES, IMAGINED // (CHAINS * horizon)))
+
+
+def _parts(observations: Observations, chunk: int) -> Iterator[Observations]:
+    for start in range(0, len(next(iter(observations.values()))), chunk):
+        yield {name: stream[start : start + chunk] for name, stream in observations.items()}
+
+
+def _worst(parts: Sequence[WorstChain]) -> Explorations:
+    """One of each state, in order."""
+    scores = torch.cat([part.error for part in parts]).cpu() if parts else torch.zeros(0)
+    actions = torch.cat([part.actions for part in parts]).cpu() if parts else torch.zeros(0, 1)
+    return Explorations(torch.arange(len(scores)), actions, scores)
+
+
+def _checked(strategy: Cycle, found: Explorations) -> Explorations:
+    """Raises NonFiniteScoreError."""
     bad = torch.nonzero(~torch.isfinite(found.scores)).flatten().tolist()
     if bad:
         where = f"action {found.actions[bad[0]].tolist()} at state {int(found.states[bad[0]])}"

@@ -26,7 +26,7 @@ def order(
     Of each state only the best is among them: several actions there may have no effect, whatever the world model
     expects, and that is one trajectory and one label. The best are shared out among the actions, of which the rule
     orders each one's by themselves: what the world model is wrong about most may all be of one action, and teach one
-    thing. observations: the states (B, ...) that `explore` was given.
+    thing. Of actions in a box the rule orders all. observations: the states (B, ...) that `explore` was given.
     """
     best = _best_of_each(found)
     best = best[top(found.scores[best], count)]
@@ -41,6 +41,8 @@ def order(
             chain = SegmentBatch(predicted_chain(world_model, states, actions))
             parts.append(description(rule.reads, world_model, chain, actions))
         candidates = Candidates(found.scores[best], **{rule.reads: torch.cat(parts).cpu()})
+    if found.actions.dim() == 3:  # vectors: no two actions are the same
+        return best[rule.order(candidates, len(best), generator)]
     return best[_shared_out(rule, candidates, found.actions[best, 0], generator)]
 
 

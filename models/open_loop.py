@@ -1,6 +1,7 @@
 """Open-loop errors: how far a world model's predictions are from what was observed, after one observation."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -9,6 +10,40 @@ from models.segments import SegmentBatch, first
 from models.world_models.base import WorldModel
 
 HORIZONS = (8, 32)
+
+
+@dataclass(frozen=True)
+class OpenLoopError:
+    """Up to a horizon, by stream: squared errors of the world model, and of a prediction that nothing moves."""
+
+    horizon: int
+    errors: dict[str, float]
+    standing_still: dict[str, float]
+
+    @property
+    def unforeseen(self) -> float | None:
+        """Share of what changes that is not foreseen, mean over the streams that change; None where none does."""
+        shares = [self.errors[name] / still for name, still in self.standing_still.items() if still > 0.0]
+        return sum(shares) / len(shares) if shares else None
+
+
+def open_loop(
+    world_model: WorldModel, batch: SegmentBatch, after_each: Callable[[], None] = lambda: None
+) -> tuple[OpenLoopError, ...]:
+    """At those of HORIZONS that segments reach, and at their end. Raises ValueError for unlabeled segments."""
+    horizons = sorted({horizon for horizon in HORIZONS if horizon < batch.length} | {batch.length})
+    errors = open_loop_errors(world_model, batch, horizons, after_each=after_each)
+    still = standing_still_errors(batch, horizons)
+    return tuple(OpenLoopError(horizon, errors[horizon], still[horizon]) for horizon in horizons)
+
+
+def standing_still_errors(batch: SegmentBatch, horizons: Sequence[int] = HORIZONS) -> dict[int, dict[str, float]]:
+    """As `open_loop_errors`, of a prediction that all stays as it was first seen."""
+    errors = {}
+    for name, stream in batch.observations.items():  # (B, L+1, ...)
+        steps = [_squared(stream[:, 0], stream[:, step]).double().mean() for step in range(1, batch.length + 1)]
+        errors[name] = torch.stack(steps).cpu()
+    return {horizon: {name: float(each[:horizon].mean()) for name, each in errors.items()} for horizon in horizons}
 
 
 @torch.inference_mode()

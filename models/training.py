@@ -63,6 +63,10 @@ class TrainingState:
     tensors: dict[str, Tensor]
     recent: tuple[float, ...] = ()  # losses of the last tenth of the schedule
 
+    def weights(self) -> dict[str, Tensor]:
+        """Of the model."""
+        return _under(self.tensors, "model.")
+
     def to_bytes(self) -> bytes:
         """Safetensors, with step, config and recent losses as JSON metadata."""
         meta = {"step": self.step, "config": asdict(self.config), "recent": [loss.hex() for loss in self.recent]}
@@ -173,7 +177,7 @@ class _Run:
         self.dataset = SegmentBatch(dataset.observations, dataset.actions, dataset.action_sets)
         self.action_free = action_free
         self.beside: SegmentBatch | None = None  # the minibatch of it
-        model.load_state_dict(_under(state.tensors, "model."))
+        model.load_state_dict(state.weights())
         self.parameters = dict(model.named_parameters())
         self.optimiser = torch.optim.AdamW(
             self.parameters.values(), lr=state.config.learning_rate, weight_decay=state.config.weight_decay, fused=True

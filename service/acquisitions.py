@@ -62,7 +62,7 @@ def acquire(session: Session, request: AcquireRequest, clock: Clock, limits: sco
     Raises UnknownResource, UnknownStrategy, PrivilegedStrategy, PoolExhausted, BudgetExhausted.
     """
     project = projects.find(session, request.project)
-    requested = _known(request.strategy or projects.policy_of(project).strategy)
+    requested = _known(project, request.strategy or projects.policy_of(project).strategy)
     ranked = request.purpose == "pool" and request.mode == "pool"
     first = _front_of_queue(session, project, requested, request.count, clock()) if ranked else None
     chooses = proposals.proposing(session, project, requested) if request.mode == "explore" else None
@@ -122,10 +122,10 @@ def _told(
     )
 
 
-def _known(strategy: str) -> str:
+def _known(project: ProjectRow, strategy: str) -> str:
     if strategy not in STRATEGY_NAMES:
         raise UnknownStrategy("strategy", strategy, f"must be one of {', '.join(STRATEGY_NAMES)}")
-    projects.refuse_privileged("strategy", strategy)
+    projects.refuse_unfit("strategy", strategy, projects.spaces_of(project))
     return strategy
 
 

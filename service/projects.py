@@ -7,11 +7,11 @@ from uuid import UUID
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from api_schemas.environments import Environment, Spaces
+from api_schemas.environments import DiscreteActions, Environment, Spaces
 from api_schemas.projects import Budget, LabelingPolicy, PoolCounts, Project, ProjectCreate, ProjectPatch
-from api_schemas.strategies import PRIVILEGED
+from api_schemas.strategies import PRIVILEGED, TRY_EVERY_ACTION
 from service import events
-from service.errors import NameTaken, PrivilegedStrategy, UnknownResource
+from service.errors import InvalidField, NameTaken, PrivilegedStrategy, UnknownResource
 from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
 from service.store.queries import rows
@@ -20,8 +20,8 @@ from service.store.tables import ProjectRow
 
 
 def create(session: Session, request: ProjectCreate, now: datetime) -> ProjectRow:
-    """A new project. Raises NameTaken, PrivilegedStrategy."""
-    refuse_privileged("policy.strategy", request.policy.strategy)
+    """A new project. Raises NameTaken, PrivilegedStrategy, NotForBoxes."""
+    refuse_unfit("policy.strategy", request.policy.strategy, request.resolved_spaces())
     if pool_queries.project_named(session, request.name) is not None:
         raise NameTaken(request.name)
     row = ProjectRow(
@@ -29,6 +29,7 @@ def create(session: Session, request: ProjectCreate, now: datetime) -> ProjectRo
         environment=request.environment.model_dump(mode="json"),
         spaces=request.resolved_spaces().model_dump(mode="json"),
         family=request.resolved_family(),
+        preset=request.resolved_preset(),
         segment_length=request.segment_length,
         stride=request.stride or request.segment_length,
         held_out_fraction=request.held_out_fraction,
@@ -67,11 +68,11 @@ def named(session: Session, name: str) -> ProjectRow:
 def change(session: Session, project_id: UUID, patch: ProjectPatch, now: datetime) -> ProjectRow:
     """Change the labeling policy; fields that were not sent stay. A null label_budget lifts the budget.
 
-    Raises PrivilegedStrategy.
+    Raises PrivilegedStrategy, NotForBoxes.
     """
-    if patch.strategy is not None:
-        refuse_privileged("strategy", patch.strategy)
     row = find(session, project_id, lock=True)
+    if patch.strategy is not None:
+        refuse_unfit("strategy", patch.strategy, spaces_of(row))
     sent = patch.model_dump(exclude_unset=True)
     changes = {name: value for name, value in sent.items() if value is not None or name == "label_budget"}
     row.policy = LabelingPolicy.model_validate(row.policy | changes).model_dump(mode="json")
@@ -79,10 +80,19 @@ def change(session: Session, project_id: UUID, patch: ProjectPatch, now: datetim
     return row
 
 
-def refuse_privileged(field: str, strategy: str) -> None:
-    """A strategy that needs hidden actions is for benchmarks only. Raises PrivilegedStrategy."""
+class NotForBoxes(InvalidField):
+    """This strategy does not take this project's actions."""
+
+
+def refuse_unfit(field: str, strategy: str, spaces: Spaces) -> None:
+    """A strategy that needs hidden actions is for benchmarks only, and one that tries every action for finite sets.
+
+    Raises PrivilegedStrategy, NotForBoxes.
+    """
     if strategy in PRIVILEGED:
         raise PrivilegedStrategy(field, strategy)
+    if strategy in TRY_EVERY_ACTION and not isinstance(spaces.actions, DiscreteActions):
+        raise NotForBoxes(field, strategy, "tries every action; those of this project are a box")
 
 
 def policy_of(row: ProjectRow) -> LabelingPolicy:
@@ -149,6 +159,7 @@ def describe(session: Session, row: ProjectRow, now: datetime) -> Project:
         name=row.name,
         environment=environment_of(row),
         family=row.family,  # type: ignore[arg-type]  # pydantic checks the literal
+        preset=row.preset,  # type: ignore[arg-type]  # pydantic checks the literal
         segment_length=row.segment_length,
         stride=row.stride,
         held_out_fraction=row.held_out_fraction,

@@ -12,6 +12,8 @@ from service.errors import UnknownResource
 from service.store.queries import rounds as queries
 from service.store.tables import ModelVersionRow
 
+OF_ROWS = ("project", "round", "parent")  # fields whose columns say that they are ids
+
 
 @dataclass(frozen=True)
 class TrainedModel:
@@ -24,6 +26,7 @@ class TrainedModel:
     sha256: str
     bytes: int
     metrics: dict[str, float]
+    parent: UUID | None = None
 
 
 def register(
@@ -41,6 +44,7 @@ def register(
         bytes=model.bytes,
         watermark=watermark,
         metrics=dict(model.metrics),
+        parent_id=model.parent,
         created_at=now,
     )
     session.add(row)
@@ -52,7 +56,9 @@ def register(
 def trained(row: ModelVersionRow) -> TrainedModel:
     """What was registered, to be registered for another round as well."""
     fields = (row.kind, row.member, row.family, dict(row.config), row.sha256, row.bytes)
-    return TrainedModel(*fields, metrics={name: float(str(value)) for name, value in row.metrics.items()})
+    return TrainedModel(
+        *fields, metrics={name: float(str(value)) for name, value in row.metrics.items()}, parent=row.parent_id
+    )
 
 
 def find(session: Session, model_id: UUID) -> ModelVersionRow:
@@ -70,5 +76,5 @@ def of_round(session: Session, round_id: UUID, kind: str) -> list[ModelVersionRo
 
 def describe(row: ModelVersionRow) -> ModelVersion:
     """The model version as the API shows it."""
-    fields = {name: getattr(row, name) for name in ModelVersion.model_fields if name not in ("project", "round")}
-    return ModelVersion(project=row.project_id, round=row.round_id, **fields)
+    fields = {name: getattr(row, name) for name in ModelVersion.model_fields if name not in OF_ROWS}
+    return ModelVersion(project=row.project_id, round=row.round_id, parent=row.parent_id, **fields)

@@ -43,7 +43,8 @@ def request(session: Session, project: ProjectRow, now: datetime, max_attempts: 
     )
     session.add(row)
     session.flush()
-    payload = TrainRound(round=row.id, strategy=projects.policy_of(project).strategy)
+    newest_member = pool_queries.newest_membership(session, project.id, "pool")
+    payload = TrainRound(round=row.id, strategy=projects.policy_of(project).strategy, memberships=newest_member)
     row.job_id = jobs.enqueue(session, project.id, payload, row.id, now, max_attempts).id
     project.labels_at_round = project.pool_labels
     _request_subgoal_generator(session, project, now, max_attempts)

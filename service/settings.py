@@ -56,6 +56,14 @@ class Settings(BaseSettings):
     queue_length: int = Field(default=2000, ge=1, description="ranked segments kept ready in the database")
     shard_transitions: int = Field(default=100_000, ge=1)
     torch_threads: int = Field(default=1, ge=1)
+    devices: str = Field(
+        default="cpu",
+        pattern=r"^(cpu|cuda(:\d+)?)(,(cpu|cuda(:\d+)?))*$",
+        description="where networks are trained: cpu, cuda, or several as cuda:0,cuda:1, a process each",
+    )
+    training_bytes: int = Field(
+        default=2 * 2**30, ge=2**20, description="of the pool's observations that are kept in memory in training"
+    )
     pool_size: int = Field(
         default=POOL_SIZE, ge=1, description="connections to the database that the API holds at most"
     )
@@ -72,6 +80,11 @@ class Settings(BaseSettings):
         """The data folder; a new one is this user's alone."""
         self.data_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         return self.data_folder.absolute()
+
+    @property
+    def training_devices(self) -> tuple[str, ...]:
+        """Of training, in order."""
+        return tuple(self.devices.split(","))
 
     @property
     def embedded(self) -> bool:

@@ -1,8 +1,9 @@
 """From rows and blobs to segment batches. Observations and labels only: nothing here can open a simulator state."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from api_schemas.environments import DiscreteActions, Spaces
+from api_schemas.environments import Actions, DiscreteActions, Spaces
 from models.families import BoxAction, DiscreteAction, StreamSpec
 from models.families import Spaces as ModelSpaces
 from models.segments import Segment, SegmentBatch, concatenate
@@ -23,7 +24,7 @@ from service.store.queries import pool as pool_queries
 from service.store.tables import LabelRow, MembershipRow, ProjectRow
 
 AfterEach = Callable[[], None]  # called after each trajectory is read; may raise to stop
-CHUNK_SEGMENTS = 2048  # segments decoded at a time: bounds memory whatever the size of the pool
+CHUNK_SEGMENTS, CHUNK_BYTES = 2048, 2**28  # decoded at a time: bounds memory whatever the size of the pool
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,26 @@ def model_spaces(spaces: Spaces) -> ModelSpaces:
     action = spaces.actions
     if isinstance(action, DiscreteActions):
         return ModelSpaces(streams, DiscreteAction(action.n))
-    return ModelSpaces(streams, BoxAction(action.low, action.high, action.shape))
+    return ModelSpaces(streams, BoxAction(action.low, action.high, action.shape, action.signs))
+
+
+def groups(actions: Actions) -> Mapping[str, Sequence[int]]:
+    """Groups of actions for which model error is reported apart; of a box there are none."""
+    return actions.groups if isinstance(actions, DiscreteActions) else {}
+
+
+def fitting(project: ProjectRow, count: int, most: int) -> int:
+    """How many of `count` segments have observations that fit into `most` bytes as arrays, at least 1."""
+    streams = projects.spaces_of(project).observations.values()
+    observation = sum(math.prod(stream.shape) * np.dtype(stream.dtype).itemsize for stream in streams)
+    return max(1, min(count, most // (observation * (project.segment_length + 1))))
+
+
+def thinned(project: ProjectRow, windows: Sequence[Windows], count: int, most: int) -> list[Windows]:
+    """Evenly as many of all segments as are no more than `count` and fit into `most` bytes, of each trajectory some."""
+    total = sum(len(window.starts) for window in windows)
+    every = -(-total // fitting(project, max(1, count), most))
+    return [replace(window, starts=window.starts[::every]) for window in windows if window.starts]
 
 
 def windows_of(
@@ -74,36 +94,37 @@ def load(blobs: Blobs, windows: Sequence[Windows], length: int, after_each: Afte
 
 
 def chunks(
-    blobs: Blobs, windows: Sequence[Windows], length: int, after_each: AfterEach = lambda: None
+    blobs: Blobs, project: ProjectRow, windows: Sequence[Windows], after_each: AfterEach = lambda: None
 ) -> Iterator[SegmentBatch]:
-    """The same segments in batches of about CHUNK_SEGMENTS, whole trajectories each, one read ahead of its use.
+    """The same segments in batches of about CHUNK_SEGMENTS or CHUNK_BYTES, whole trajectories each, one read ahead.
 
     Reading waits for disk or network most of the time, so the next batch is read while this one is scored.
     """
-    groups = _groups(windows)
+    length = project.segment_length
+    parts = _parts(windows, fitting(project, CHUNK_SEGMENTS, CHUNK_BYTES))
     with ThreadPoolExecutor(1, "read-ahead") as reader:
         ahead = None
-        for group in groups:
-            ready, ahead = ahead, reader.submit(load, blobs, group, length, after_each)
+        for part in parts:
+            ready, ahead = ahead, reader.submit(load, blobs, part, length, after_each)
             if ready is not None:
                 yield ready.result()
         if ahead is not None:
             yield ahead.result()
 
 
-def _groups(windows: Sequence[Windows]) -> Iterator[list[Windows]]:
-    group: list[Windows] = []
+def _parts(windows: Sequence[Windows], most: int) -> Iterator[list[Windows]]:
+    part: list[Windows] = []
     segments = 0
     for window in windows:
         if not window.starts:
             continue
-        group.append(window)
+        part.append(window)
         segments += len(window.starts)
-        if segments >= CHUNK_SEGMENTS:
-            yield group
-            group, segments = [], 0
-    if group:
-        yield group
+        if segments >= most:
+            yield part
+            part, segments = [], 0
+    if part:
+        yield part
 
 
 def labeled_batch(

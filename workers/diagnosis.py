@@ -7,7 +7,7 @@ from dataclasses import asdict
 import torch
 from sqlalchemy.orm import Session
 
-from api_schemas.environments import DiscreteActions
+from api_schemas.environments import Actions, DiscreteActions
 from api_schemas.rounds import Diagnostics
 from models.chance import training_generator
 from models.diagnostic_warnings import warnings
@@ -22,14 +22,15 @@ from workers.evaluation import load_network
 from workers.job import RunningJob
 
 PROGRESS = 0.97  # of the round's job: all that is left is to ask for the scoring
-SAMPLE = 2000  # pool segments: a share of a half is known to 1.1 % then (one standard error)
+SAMPLE = 2000  # pool segments, if they fit: a share of a half is known to 1.1 % then (one standard error)
+SAMPLE_BYTES = 2**28
 
 
 def diagnose_round(job: RunningJob, project: ProjectRow, row: RoundRow, labeled: SegmentBatch) -> None:
     """Diagnose a round that has its models, unless an earlier attempt did. `labeled`: what they trained on."""
     actions = projects.spaces_of(project).actions
     with job.worker.database.read() as session:
-        if rounds.find(session, row.id).diagnostics is not None or not isinstance(actions, DiscreteActions):
+        if rounds.find(session, row.id).diagnostics is not None:
             return
         (world_model,) = registry.of_round(session, row.id, "world_model")
         (inverse,) = registry.of_round(session, row.id, "inverse_dynamics")
@@ -43,7 +44,7 @@ def diagnose_round(job: RunningJob, project: ProjectRow, row: RoundRow, labeled:
         labeled,
         data.load(worker.blobs, windows, length, job.go_on) if windows else None,
         data.labeled_batch(worker.database, worker.blobs, project, "held_out", row.watermark, job.go_on),
-        {name: set(members) for name, members in actions.groups.items()},
+        {name: set(members) for name, members in data.groups(actions).items()},
         job.go_on,
     )
     with job.transaction() as session:
@@ -51,9 +52,10 @@ def diagnose_round(job: RunningJob, project: ProjectRow, row: RoundRow, labeled:
         rounds.stage_done(session, row.id, "diagnostics", time.monotonic() - started)
 
 
-def _described(figures: Figures, actions: DiscreteActions) -> Diagnostics:
+def _described(figures: Figures, actions: Actions) -> Diagnostics:
     """As the API shows them."""
-    names = [actions.names[i] if i < len(actions.names) else f"action {i}" for i in range(actions.n)]
+    given = actions.names if isinstance(actions, DiscreteActions) else ()
+    names = [given[i] if i < len(given) else f"action {i}" for i in range(len(figures.actions))]
     known = [
         {**asdict(each), "action": i, "name": name}
         for i, (each, name) in enumerate(zip(figures.actions, names, strict=True))
@@ -69,7 +71,7 @@ def _sampled(
     ends = torch.tensor([0, *(member.segments for member in members)]).cumsum(0)
     first = {member.trajectory_id: int(end) for member, end in zip(members, ends[:-1], strict=True)}
     taken = [first[name] + start // project.stride for name, start in labeled.segments]
-    places = draw_places(int(ends[-1]), taken, SAMPLE, generator)
+    places = draw_places(int(ends[-1]), taken, data.fitting(project, SAMPLE, SAMPLE_BYTES), generator)
     starts: dict[str, list[int]] = {}
     for place, number in zip(places, torch.searchsorted(ends, torch.tensor(places), right=True).tolist(), strict=True):
         name = members[number - 1].trajectory_id

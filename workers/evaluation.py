@@ -1,8 +1,8 @@
 """Model error of a round on the project's labeled held-out segments."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 
-from api_schemas.environments import DiscreteActions
 from api_schemas.rounds import GroupError, ModelError
 from models import checkpoints
 from models.evaluation import GroupError as GroupFigures
@@ -12,6 +12,7 @@ from models.segments import SegmentBatch
 from service import projects
 from service.store.blobs import Blobs
 from service.store.tables import ModelVersionRow, ProjectRow
+from workers import data
 
 
 def model_error(
@@ -25,8 +26,7 @@ def model_error(
     """Figures are None where the held-out set is empty. after_each: called after each chunk; may raise to stop."""
     if held_out is None:
         return ModelError(transitions=0, loss=None, dynamics_accuracy=None, inverse_accuracy=None)
-    actions = projects.spaces_of(project).actions
-    groups = actions.groups if isinstance(actions, DiscreteActions) else {}
+    groups = data.groups(projects.spaces_of(project).actions)
     figures = evaluate(
         load_network(blobs, world_model, project),  # type: ignore[arg-type]  # the checkpoint's kind was checked
         held_out,
@@ -34,8 +34,10 @@ def model_error(
         load_network(blobs, inverse_dynamics, project),  # type: ignore[arg-type]  # the checkpoint's kind was checked
         after_each=after_each,
     )
+    overall = _group(figures.overall).model_dump() | {"loss": figures.loss}
     by_group = {name: _group(group) for name, group in figures.groups.items()}
-    return ModelError.model_validate({**_group(figures.overall).model_dump(), "by_group": by_group})
+    open_loop = [asdict(each) for each in figures.open_loop]
+    return ModelError.model_validate({**overall, "by_group": by_group, "open_loop": open_loop})
 
 
 def load_network(blobs: Blobs, row: ModelVersionRow, project: ProjectRow) -> Network:

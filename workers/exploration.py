@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from models.acquisition import BATCH_RULES, EXPLORING, Cycle, Models
 from models.chance import scoring_generator
-from models.exploration import STATES, Asked, asked, distinct, explore, looks
+from models.exploration import Asked, asked, distinct, explore, looks, states_to_look_at
 from models.exploration_queue import order
 from models.segments import Observations, at, take
 from service import draws, projects, proposals, rounds, scorings
@@ -79,7 +79,8 @@ def _plan(session: Session, scoring_id: UUID) -> Plan | None:
     members = pool_queries.count_members(session, project.id, "pool", scoring.memberships)
     generator = scoring_generator(project.seed, scoring.strategy, round_row.number, members, what)
     there = draws.states(session, project, last=scoring.memberships)
-    states = [there.at(project, place) for place in draw_places(there.count, [], STATES, generator)]
+    count = states_to_look_at(data.model_spaces(projects.spaces_of(project)).action, project.segment_length)
+    states = [there.at(project, place) for place in draw_places(there.count, [], count, generator)]
     explored = acquisition_queries.explored(session, project.id, scoring.round_id)
     names = sorted({name for name, _ in states} | {name for name, *_ in explored})
     blobs = {name: row.blob_sha256 for name, row in pool_queries.contents(session, names).items()}

@@ -30,6 +30,7 @@ from workers.evaluation import load_network
 from workers.job import RunningJob
 
 log = get_logger("worker")
+QUEUE_BYTES = 2**30  # of the candidates' observations: a queue of long image segments is shorter than the settings say
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,8 @@ def run_selection(job: RunningJob, scoring_id: UUID, length: int) -> dict[str, o
         taken = pool_queries.taken_starts(session, project.id, "pool", job.now())
         members = {row.id: row for row in pool_queries.memberships(session, project.id, "pool")}
     pool = _unpack(job.worker.blobs, [sha for sha in shas if sha is not None], job.go_on)
+    if scorings.NEEDS[scoring.strategy]:  # what is ordered by models is read first
+        length = data.fitting(project, length, QUEUE_BYTES)
     candidates = _candidates(pool, members, taken, length)
     job.report(0.3, f"selecting from {len(candidates)} candidates")
     ordered = _ordered(job, project, scoring, pool, candidates, members)
@@ -133,7 +136,7 @@ def _scores(
     models = _load(job, project, scoring)
     total = sum(len(window.starts) for window in windows)
     parts: list[torch.Tensor] = []
-    for batch in data.chunks(job.worker.blobs, windows, project.segment_length, job.go_on):
+    for batch in data.chunks(job.worker.blobs, project, windows, job.go_on):
         parts.append(score_pool(STRATEGIES[scoring.strategy], models, batch, generator, after_each=job.go_on))
         done = sum(len(part) for part in parts)
         job.report(done / total, f"scored {done} of {total} segments with {scoring.strategy}")

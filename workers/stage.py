@@ -11,12 +11,13 @@ from sqlalchemy.orm import Session
 
 from models.network import Network
 from models.segments import SegmentBatch
-from models.training import TrainingConfig, TrainingState, advance, begin
+from models.training import TrainingConfig, TrainingState, begin
 from service import events, jobs
 from service.log import get_logger
 from service.store.tables import JobRow
 from workers.checkpoint import Checkpoint
 from workers.job import GaveWay, RunningJob
+from workers.trainer import Advance, trainer
 
 log = get_logger("worker")
 FIRST_STEPS = 5  # of a slice; the later ones follow the time that it took
@@ -33,25 +34,36 @@ class Stage:
         self._stored = 0  # the step of the newest checkpoint
 
     def train(
-        self, network: Network, batch: SegmentBatch, config: TrainingConfig, generator: torch.Generator, tell: Tell
+        self,
+        network: Network,
+        batch: SegmentBatch,
+        config: TrainingConfig,
+        generator: torch.Generator,
+        tell: Tell,
+        action_free: SegmentBatch | None = None,
     ) -> TrainingState:
         """Train to the end of the schedule, from where an earlier attempt left off. Raises GaveWay, JobLost.
 
-        The weights are those of one uninterrupted run, however it is cut. `tell` may raise to stop it.
+        The weights are those of one uninterrupted run, however it is cut. `tell` may raise to stop it. action_free:
+        what a SemiSupervised network reads besides.
         """
         state = self._resumed(network, batch, config) or begin(network, config, generator)
-        steps, loss, saved = FIRST_STEPS, [0.0], time.monotonic()
         self._stored = state.step
         self._job.prepared()
-        while state.step < config.steps:
+        with trainer(network, batch, state, self._job.worker.settings.training_devices, action_free) as advance:
+            return self._advanced(state, advance, tell)
+
+    def _advanced(self, state: TrainingState, advance: Advance, tell: Tell) -> TrainingState:
+        """Slice by slice to the end, with a checkpoint now and then."""
+        steps, saved = FIRST_STEPS, time.monotonic()
+        while state.step < state.config.steps:
             started = time.monotonic()
             if started - saved >= self._job.worker.settings.checkpoint_seconds:
                 self._store(state)
                 saved = started
-            until = min(state.step + steps, config.steps)
-            state = advance(network, batch, state, until, progress=lambda *now: loss.append(now[-1]))
+            state, loss = advance(state, min(state.step + steps, state.config.steps))
             steps = _next_steps(steps, time.monotonic() - started)
-            self._look_up(state, loss[-1], tell)
+            self._look_up(state, loss, tell)
         return state
 
     @contextmanager

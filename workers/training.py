@@ -7,22 +7,23 @@ from dataclasses import dataclass
 from api_schemas.jobs import TrainRound, TrainSubgoalGenerator
 from models import checkpoints
 from models.chance import training_generator
-from models.families import Family, family_named
-from models.network import Network
+from models.network import SemiSupervised
 from models.segments import SegmentBatch
 from models.training import TrainingState
 from service import jobs, projects, registry, rounds, scorings
-from service.errors import NoModelFamily, NothingToLearn
+from service.errors import NothingToLearn
 from service.registry import TrainedModel
 from service.store.queries import acquisitions as scoring_queries
 from service.store.queries import pool as pool_queries
 from service.store.queries import rounds as round_queries
 from service.store.tables import ProjectRow, RoundRow
 from workers import data
+from workers.beginnings import Beginning, beginning
 from workers.diagnosis import diagnose_round
 from workers.evaluation import model_error
 from workers.job import RunningJob
 from workers.stage import Stage
+from workers.training_errors import explained
 
 ENSEMBLE_MEMBERS = 3
 BASE = frozenset({"inverse_dynamics", "world_model"})  # every round has these; model error is theirs
@@ -34,22 +35,18 @@ ORDER = (
     "ensemble",
     "subgoal_generator",
 )
-SUBGOAL_SEGMENTS = 50_000  # a larger pool is thinned out evenly
+ACTION_FREE_SEGMENTS = 50_000  # a larger pool is thinned out evenly
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a round trains on, and which networks."""
+    """What a round trains on, and which networks. memberships: of the pool up to this id; None: all."""
 
     project: ProjectRow
     round: RoundRow
     strategy: str
     stages: tuple[tuple[str, int], ...]
-
-    @property
-    def family(self) -> Family:
-        """The project's model family."""
-        return _family(self.project)
+    memberships: int | None
 
 
 def run_round(job: RunningJob, payload: TrainRound) -> dict[str, object]:
@@ -95,19 +92,22 @@ def run_subgoal_generator(job: RunningJob, payload: TrainSubgoalGenerator) -> di
 def _trained_subgoal_generator(
     job: RunningJob, project: ProjectRow, windows: Sequence[data.Windows], stage: Stage
 ) -> TrainedModel:
-    every = max(1, sum(len(window.starts) for window in windows) // SUBGOAL_SEGMENTS)
-    thinned = [data.Windows(w.trajectory, w.blob_sha256, w.starts[::every]) for w in windows if w.starts]
-    batch = data.load(job.worker.blobs, thinned, project.segment_length, job.go_on)
-    family = _family(project)
+    batch = _action_free(job, project, windows)
     generator = training_generator(project.seed, 0, "subgoal_generator")
-    network = family.build_subgoal_generator(data.model_spaces(projects.spaces_of(project)), None, generator)
-    config = family.training_config("subgoal_generator", batch.size)
+    begun = beginning(job, project, None, "subgoal_generator", 0, batch.size, generator)
 
     def tell(step: int, steps: int, loss: float) -> None:
         job.report(step / steps, f"subgoal generator, step {step} of {steps}, loss {loss:.3f}")
 
-    state = stage.train(network, batch, config, generator, tell)
-    return _trained(job, "subgoal_generator", 0, network, state)
+    with explained(project, "subgoal generator"):
+        state = stage.train(begun.network, batch, begun.config, generator, tell)
+    return _trained(job, "subgoal_generator", 0, begun, state)
+
+
+def _action_free(job: RunningJob, project: ProjectRow, windows: Sequence[data.Windows]) -> SegmentBatch:
+    """The pool's segments without labels, evenly thinned out to what fits."""
+    thinned = data.thinned(project, windows, ACTION_FREE_SEGMENTS, job.worker.settings.training_bytes)
+    return data.load(job.worker.blobs, thinned, project.segment_length, job.go_on)
 
 
 def _subgoal_stage(job: RunningJob, plan: Plan) -> None:
@@ -137,13 +137,8 @@ def _plan(job: RunningJob, payload: TrainRound) -> Plan:
     stages = tuple((kind, member) for kind in ORDER if kind in kinds for member in range(members.get(kind, 1)))
     with job.worker.database.read() as session:
         round_row = rounds.find(session, payload.round)
-        return Plan(projects.find(session, round_row.project_id), round_row, payload.strategy, stages)
-
-
-def _family(project: ProjectRow) -> Family:
-    if project.family is None:
-        raise NoModelFamily(project.id)
-    return family_named(project.family)
+        project = projects.find(session, round_row.project_id)
+        return Plan(project, round_row, payload.strategy, stages, payload.memberships)
 
 
 def _labels(job: RunningJob, plan: Plan, split: str) -> SegmentBatch | None:
@@ -157,24 +152,31 @@ def _train_stage(job: RunningJob, plan: Plan, kind: str, member: int, labeled: S
         if any(row.member == member for row in registry.of_round(session, plan.round.id, kind)):
             return
     started = time.monotonic()
-    network_kind = "world_model" if kind == "ensemble" else kind
     generator = training_generator(plan.project.seed, plan.round.number, kind, member)
-    spaces = data.model_spaces(projects.spaces_of(plan.project))
-    network = plan.family.build(network_kind, spaces, {}, generator)
+    begun = beginning(job, plan.project, plan.round, kind, member, labeled.size, generator)
+    beside = _pool(job, plan) if isinstance(begun.network, SemiSupervised) else None
 
     def tell(step: int, steps: int, loss: float) -> None:
         share = (number + step / steps) / (len(plan.stages) + 1)
         job.report(share, f"round {plan.round.number}: {kind}, step {step} of {steps}, loss {loss:.3f}")
 
-    config = plan.family.training_config(network_kind, labeled.size)
     name = f"{kind}-{member}" if kind == "ensemble" else kind
     stage = Stage(job, name, plan.round.id)
-    state = stage.train(network, labeled, config, generator, tell)
-    trained = _trained(job, kind, member, network, state)
+    with explained(plan.project, f"round {plan.round.number}, {name}"):
+        state = stage.train(begun.network, labeled, begun.config, generator, tell, beside)
+    trained = _trained(job, kind, member, begun, state)
     with stage.finished() as session:
         registry.register(session, plan.project.id, plan.round.id, trained, plan.round.watermark, job.now())
         jobs.made_progress(session, job.lease)
         rounds.stage_done(session, plan.round.id, name, time.monotonic() - started)
+
+
+def _pool(job: RunningJob, plan: Plan) -> SegmentBatch:
+    """What a network learns from that reads action-free segments beside the labels."""
+    with job.worker.database.read() as session:
+        members = pool_queries.memberships(session, plan.project.id, "pool", last=plan.memberships)
+        windows = data.windows_of(session, plan.project, members, None)
+    return _action_free(job, plan.project, windows)
 
 
 def _evaluate_stage(job: RunningJob, plan: Plan) -> None:
@@ -210,8 +212,9 @@ def _request_scoring(job: RunningJob, plan: Plan) -> dict[str, object]:
     return {"round": str(plan.round.id), "models": len(models)}
 
 
-def _trained(job: RunningJob, kind: str, member: int, network: Network, state: TrainingState) -> TrainedModel:
-    metrics, blob = {"loss": sum(state.recent) / len(state.recent)}, checkpoints.save(network)
+def _trained(job: RunningJob, kind: str, member: int, begun: Beginning, state: TrainingState) -> TrainedModel:
+    metrics, blob = {"loss": sum(state.recent) / len(state.recent)}, checkpoints.save(begun.network)
     description = checkpoints.describe(blob)
     sha256 = job.worker.blobs.put("weights", blob)
-    return TrainedModel(kind, member, description["family"], description["config"], sha256, len(blob), metrics)
+    fields = (kind, member, description["family"], description["config"], sha256, len(blob), metrics)
+    return TrainedModel(*fields, parent=begun.parent)

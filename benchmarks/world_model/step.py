@@ -16,7 +16,7 @@ from models.world_models.recurrent import PAPER, RecurrentWorldModel
 SEQUENCES = 16
 IMAGE = StreamSpec((64, 64, 3), "uint8")
 SPACES = Spaces(
-    {"front": IMAGE, "wrist": IMAGE, "proprioception": StreamSpec((11,), "float32")}, BoxAction(-1.0, 1.0, (7,))
+    {"front": IMAGE, "wrist": IMAGE, "proprioception": StreamSpec((11,), "float32")}, BoxAction(-1.0, 1.0, (7,), (6,))
 )
 T = TypeVar("T")
 PARTS = ("encoder", "recurrence", "decoder", "optimizer")

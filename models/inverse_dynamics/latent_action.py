@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from models.inverse_dynamics.boxes import BoxHead, box_size, check_labels, labels
+from models.inverse_dynamics.boxes import BoxHead, check_labels, labels
 from models.networks.frame_changes import FrameChanges
 from models.networks.initialisation import initialise, linear, table
 from models.networks.space_time_transformer import SpaceTimeTransformer
@@ -36,7 +36,6 @@ SMOOTHING = 1e-12
 class LatentActionConfig:
     """latent: coordinates of a latent action. sparsity: what they cost; 0 is the dense form. noise: deviation of what
     training adds to each. actor: widths of what decodes the action. every: updates from one action loss to the next.
-    signs: coordinates of an action of which only the sign counts, as of a gripper.
 
     window: observations of a training sequence. width, layers, heads, hidden: of each transformer. context: frames that
     a layer looks back. patch: pixels a side.
@@ -47,7 +46,6 @@ class LatentActionConfig:
     noise: float = 0.1
     actor: tuple[int, ...] = (128, 128)
     every: int = 2
-    signs: tuple[int, ...] = (-1,)
     window: int = 5
     width: int = 64
     layers: int = 2
@@ -58,7 +56,6 @@ class LatentActionConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "actor", tuple(self.actor))  # JSON has lists
-        object.__setattr__(self, "signs", tuple(self.signs))
         if self.sparsity < 0.0 or self.every < 1 or self.window < 2:
             found = f"{self.sparsity}, {self.every} and {self.window}"
             raise ValueError(f"sparsity must be at least 0, every at least 1 and window at least 2, got {found}.")
@@ -91,7 +88,7 @@ class LatentActionInverseDynamics(nn.Module):
         self.answer = linear(config.latent, width)
         self.decoder_tokens = Tokens(self.frames.streams, width, config.patch)
         self.decoder = SpaceTimeTransformer(*shape)
-        self.actor = BoxHead(config.latent, config.actor, spaces, config.signs)
+        self.actor = BoxHead(config.latent, config.actor, spaces)
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
         initialise(self, generator)
 
@@ -108,14 +105,14 @@ class LatentActionInverseDynamics(nn.Module):
     def check(self, batch: SegmentBatch) -> None:
         """Raises ValueError for numbers that are not finite and for actions outside of the spaces."""
         check_finite(batch)
-        check_labels(batch, box_size(self.spaces))
+        check_labels(batch, self.actor.box)
 
     def encode(self, observations: Observations) -> Tensor:
         """Latent actions: (B, L+1, ...) -> (B, L, Z). Each depends on no later observation than x_{t+1}."""
         return torch.cat([self._encode(*self.frames(part)) for part in parts(observations)])
 
     def infer(self, observations: Observations) -> Tensor:
-        """Actions (B, L, D) in [-1, 1]."""
+        """Actions (B, L, D) in the box."""
         return self.actor.actions(self.actor(self.encode(observations)))
 
     def reconstruct(self, observations: Observations, latent: Tensor) -> Observations:

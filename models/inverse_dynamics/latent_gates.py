@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from models.inverse_dynamics.boxes import BoxHead, box_size, check_labels, labels
+from models.inverse_dynamics.boxes import BoxHead, check_labels, labels
 from models.inverse_dynamics.gates import GAIN, OPEN
 from models.networks.frame_coordinates import FrameCoordinates
 from models.networks.gates import PenaltyRamp, inference_gates, open_probability, sample_gates
@@ -29,22 +29,20 @@ class LatentGatesConfig:
     """sparsity: what an open gate costs, full after `free` + `ramp` losses; 0.1 is as much as to be off by 0.3 in one
     coordinate of an action.
 
-    hidden: widths of what tells the action. latent, depth: of the images' encoder. signs: coordinates of an action of
-    which only the sign counts, as of a gripper. window: observations of a training sequence.
+    hidden: widths of what tells the action. latent, depth: of the images' encoder. window: observations of a training
+    sequence.
     """
 
     sparsity: float = 0.1
     free: int = 150
     ramp: int = 250
     hidden: tuple[int, ...] = (128, 128)
-    signs: tuple[int, ...] = (-1,)
     latent: int = 32
     depth: int = 8
     window: int = 4
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))  # JSON has lists
-        object.__setattr__(self, "signs", tuple(self.signs))
 
 
 SMALL = LatentGatesConfig()
@@ -64,7 +62,7 @@ class LatentMaskedInverseDynamics(nn.Module):
         self.change = Moments(self.frame.size)
         self.gates = table(1, self.frame.size, 0.01)
         self.penalty = PenaltyRamp(config.sparsity, config.free, config.ramp)
-        self.head = BoxHead(3 * self.frame.size + 1, config.hidden, spaces, config.signs)
+        self.head = BoxHead(3 * self.frame.size + 1, config.hidden, spaces)
         initialise(self, generator)
 
     @property
@@ -75,7 +73,7 @@ class LatentMaskedInverseDynamics(nn.Module):
     def check(self, batch: SegmentBatch) -> None:
         """Raises ValueError for numbers that are not finite and for actions outside of the spaces."""
         check_finite(batch)
-        check_labels(batch, box_size(self.spaces))
+        check_labels(batch, self.head.box)
 
     def infer(self, observations: Observations) -> Tensor:
         """Actions (B, L, D) in [-1, 1]."""

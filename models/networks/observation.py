@@ -1,6 +1,5 @@
 """Encoder and decoder of a robot's observations: camera images, and vectors of numbers."""
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from models.networks.mlp import NormalisedMlp
 from models.networks.moments import Moments
 from models.networks.symlog import symexp, symlog
 from models.segments import Observations
-from models.spaces import BoxAction, Spaces
+from models.spaces import Spaces, bounded_box
 
 
 class Frame(NamedTuple):
@@ -52,13 +51,7 @@ def check_spaces(spaces: Spaces) -> None:
     cameras = {name: stream for name, stream in spaces.observations.items() if len(stream.shape) == 3}
     if cameras:
         image.camera_size(cameras)
-    action = spaces.action
-    if (
-        not isinstance(action, BoxAction)
-        or len(action.shape) != 1
-        or not -math.inf < action.low < action.high < math.inf
-    ):
-        raise ValueError(f"The robot family takes a bounded box of shape (D,) as action space, got {action}.")
+    bounded_box(spaces)
 
 
 class Streams(nn.Module):

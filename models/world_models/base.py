@@ -16,6 +16,12 @@ class WorldModel(Network, Protocol):
     ValueError for a batch without actions.
     """
 
+    @property
+    def symbolic(self) -> bool:
+        """Whether it predicts symbols: such a prediction can be right exactly, and distances, in nats of what is seen,
+        compare between models. Else they compare within one."""
+        ...
+
     def encode(self, observations: Observations) -> Tensor:
         """Observations (B, ...) -> states (B, ...)."""
         ...

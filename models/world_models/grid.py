@@ -42,6 +42,7 @@ class GridWorldModel(nn.Module):
 
     family = "grid"
     kind = "world_model"
+    symbolic = True
     uniform: Tensor
 
     def __init__(self, spaces: Spaces, config: GridWorldModelConfig, generator: torch.Generator) -> None:

@@ -17,7 +17,7 @@ from models.networks.observation import (
 )
 from models.networks.recurrent_state_space import RecurrentStateSpace, RecurrentStateSpaceConfig
 from models.segments import Observations, SegmentBatch
-from models.spaces import BoxAction, Spaces
+from models.spaces import Spaces, bounded_box
 
 VISIBLE_GREY, VISIBLE = 16.0, 1e-3  # of 255 levels, and of a number: what is less is no change
 FRAMES = 512  # encoded at a time outside of training: bounds memory
@@ -67,14 +67,14 @@ class RecurrentWorldModel(nn.Module):
 
     family = "robot"
     kind = "world_model"
+    symbolic = False
 
     def __init__(self, spaces: Spaces, config: RecurrentWorldModelConfig, generator: torch.Generator) -> None:
         super().__init__()
         self.streams = Streams(spaces, config.standardised)  # refuses spaces that do not fit
-        assert isinstance(spaces.action, BoxAction)  # noqa: S101  # the streams refuse others
-        self.spaces, self.config, self.action = spaces, config, spaces.action
+        self.spaces, self.config, self.action = spaces, config, bounded_box(spaces)
         self.encoder = ObservationEncoder(self.streams, config)
-        self.recurrence = RecurrentStateSpace(spaces.action.shape[0], self.encoder.outputs, config)
+        self.recurrence = RecurrentStateSpace(self.action.shape[0], self.encoder.outputs, config)
         self.decoder = ObservationDecoder(config.state, self.streams, config)
         initialise(self, generator)
 
@@ -124,11 +124,11 @@ class RecurrentWorldModel(nn.Module):
         if actions is None or actions.shape[1] != expected:
             found = "none" if actions is None else str(actions.shape[1])
             raise ValueError(f"{steps} observations have {expected} actions between them, got {found}.")
-        return self.recurrence.filter(embeddings, self._scaled(actions), context=context).states[:, -1]
+        return self.recurrence.filter(embeddings, self.action.unit(actions), context=context).states[:, -1]
 
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
         """(B, D), (B, L, A) -> (B, L, D)."""
-        return self.recurrence.imagine(state, self._scaled(actions))
+        return self.recurrence.imagine(state, self.action.unit(actions))
 
     def distance(self, prediction: Tensor, reference: Observations) -> Tensor:
         """sum_t KL(q(z_t | h_t, x_t) || p(z_t | h_t)) along predicted h_t: (B, L, D), (B, L, ...) -> (B,) nats.
@@ -176,7 +176,7 @@ class RecurrentWorldModel(nn.Module):
 
     def latent(self, embeddings: Tensor, actions: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """States (B, T, D) drawn by uniform (B, T, G), and the loss (B, T) of their divergence from the prior."""
-        states, posterior = self.recurrence.filter(embeddings, self._scaled(actions), uniform)
+        states, posterior = self.recurrence.filter(embeddings, self.action.unit(actions), uniform)
         prior = self.recurrence.prior(self.recurrence.split(states)[0])
         dynamics = categorical.kl_divergence(posterior.detach(), prior).clamp(min=self.config.free_nats)
         representation = categorical.kl_divergence(posterior, prior.detach()).clamp(min=self.config.free_nats)
@@ -215,7 +215,7 @@ class RecurrentWorldModel(nn.Module):
 
         Actions of less than a third of the box count as none, and so do moves of less than half a deviation.
         """
-        parts = [_sign(self._scaled(actions).mean(1), 1 / 3)]
+        parts = [_sign(self.action.unit(actions).mean(1), 1 / 3)]
         numbers = self.streams.frame(observations).numbers
         if numbers is not None:
             parts.append(_sign(numbers[:, -1] - numbers[:, 0], 1 / 2))
@@ -234,11 +234,6 @@ class RecurrentWorldModel(nn.Module):
             correct += hit.flatten(1).sum(1)
             changed += visible.flatten(1).sum(1)
         return correct, changed
-
-    def _scaled(self, actions: Tensor) -> Tensor:
-        """From the box to [-1, 1]."""
-        middle, half = (self.action.high + self.action.low) / 2, (self.action.high - self.action.low) / 2
-        return (actions.float() - middle) / half
 
     def _read(self, observations: Observations) -> Tensor:
         """(B, T, ...) -> embeddings (B, T, E), a part of the frames at a time: as floats all may be too many."""

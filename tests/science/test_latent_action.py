@@ -122,7 +122,7 @@ def test_many_segments_are_read_as_each_alone_is() -> None:
 
 
 def test_pictures_alone_tell_where_the_point_was_sent() -> None:
-    model = _built(replace(CONFIG, patch=4, signs=()), toy_robot.PICTURE)
+    model = _built(replace(CONFIG, patch=4), toy_robot.PICTURE)
     generator, labeled = torch.Generator().manual_seed(0), toy_robot.pictures(300, 1, seed=1)
     train(model, labeled, replace(SCHEDULE, steps=200), generator)
     test = toy_robot.pictures(200, 1, seed=2)
@@ -161,14 +161,28 @@ def test_actions_outside_of_the_box_are_refused_by_the_name_of_their_segment() -
         train(_built(), batch, SCHEDULE, torch.Generator())
 
 
+def test_actions_of_another_box_are_told_in_it() -> None:
+    spaces = Spaces(toy_point.SPACES.observations, BoxAction(10.0, 30.0, (3,), (2,)))
+    one = toy_point.segments(200, 1, seed=1, together=0.5)
+    assert one.actions is not None
+    other = replace(one, actions=20.0 + 10.0 * one.actions)
+    schedule, found = replace(SCHEDULE, steps=20), []
+    for batch, model in ((one, _built()), (other, _built(spaces=spaces))):
+        train(model, batch, schedule, torch.Generator().manual_seed(1))
+        with torch.no_grad():
+            found.append(model.infer(one.observations))
+    torch.testing.assert_close(found[1], 20.0 + 10.0 * found[0], atol=1e-3, rtol=0.0)
+    assert set(found[1][..., 2].flatten().tolist()) <= {10.0, 30.0}
+
+
 @pytest.mark.parametrize(
     ("spaces", "config", "message"),
     [
         (Spaces(toy_point.SPACES.observations, DiscreteAction(7)), CONFIG, "box of shape (D,)"),
-        (Spaces(toy_point.SPACES.observations, BoxAction(0.0, 1.0, (3,))), CONFIG, "vectors from -1 to 1"),
+        (Spaces(toy_point.SPACES.observations, BoxAction(1.0, 1.0, (3,))), CONFIG, "bounded box of shape (D,)"),
         (Spaces({"grid": StreamSpec((5, 5), "int64")}, toy_robot.ACTION), CONFIG, "int64 (5, 5)"),
-        (toy_robot.PICTURE, replace(CONFIG, patch=5, signs=()), "not covered by patches of 5"),
-        (toy_point.SPACES, replace(CONFIG, signs=(3,)), "action of 3 numbers, got (3,)"),
+        (toy_robot.PICTURE, replace(CONFIG, patch=5), "not covered by patches of 5"),
+        (Spaces(toy_point.SPACES.observations, BoxAction(-1.0, 1.0, (3,), (3,))), CONFIG, "of 3 numbers, got (3,)"),
     ],
 )
 def test_spaces_that_do_not_fit_are_refused(spaces: Spaces, config: LatentActionConfig, message: str) -> None:

@@ -75,7 +75,7 @@ def test_what_is_read_and_what_is_left_out_are_all_coordinates(
 
 
 def test_images_have_a_latent_that_shows_them_and_tells_the_action() -> None:
-    config = replace(SMALL, signs=(), latent=8, free=1000)  # the gates stay open
+    config = replace(SMALL, latent=8, free=1000)  # the gates stay open
     model = LatentMaskedInverseDynamics(toy_robot.PICTURE, config, torch.Generator().manual_seed(0))
     action_free = toy_robot.pictures(500, 1, seed=3).without_labels()
     schedule = replace(SCHEDULE, steps=300, learning_rate=3e-3)

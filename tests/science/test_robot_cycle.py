@@ -1,16 +1,17 @@
 """The cycle over segments of several steps of a robot: actions in a box, distances in a latent space."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
-from models.acquisition import STRATEGIES, Models, score_pool
+from models.acquisition import BATCH_RULES, EXPLORING, STRATEGIES, Models, score_pool
 from models.cycle_consistency import cycle, cycle_error, worst_chain
 from models.evaluation import transition_errors
+from models.exploration import CHAINS, IMAGINED, STATES, asked, explore, looks, states_to_look_at
+from models.exploration_queue import order
 from models.inverse_dynamics.latent_gates import SMALL, LatentMaskedInverseDynamics
 from models.rank_correlation import spearman
 from models.segments import SegmentBatch, at
+from models.spaces import DiscreteAction
 from models.step_distances import nearest_true_actions
 from models.subgoal_generators import latent
 from models.subgoal_generators.latent import LatentSubgoalGenerator
@@ -34,7 +35,7 @@ def models() -> Models:
     slow = everything.take((everything.actions.abs().amax((1, 2)) < 0.9).nonzero().flatten())
     world_model = RecurrentWorldModel(toy_robot.POINT, toy_robot.TINY, generator)
     train(world_model, slow, TrainingConfig(250, 32, 1e-2, 0.0, clip=100.0), generator)
-    inverse = LatentMaskedInverseDynamics(toy_robot.POINT, replace(SMALL, signs=()), generator)
+    inverse = LatentMaskedInverseDynamics(toy_robot.POINT, SMALL, generator)
     train(inverse, everything, TrainingConfig(500, 32, 1e-2, 1e-2), generator)
     subgoals = LatentSubgoalGenerator(toy_robot.POINT, latent.SMALL, generator)
     train(subgoals, everything.without_labels(), TrainingConfig(400, 64, 3e-3, 1e-4), generator)
@@ -48,6 +49,25 @@ def test_the_score_of_observed_chains_ranks_as_the_true_loss_does(models: Models
     loss = nearest_true_actions(models.world_model, pool)[1]
     assert bool((score >= 0).all())
     assert (spearman(score, loss) or 0.0) > 0.7
+
+
+def test_explore_mode_proposes_the_worst_chain_of_every_state(models: Models, pool: SegmentBatch) -> None:
+    states = at(pool.take(slice(0, 30)).observations, 0)
+    found = explore(EXPLORING["cycle"], models, states, LENGTH, torch.Generator().manual_seed(5), chunk=20)
+    assert found.actions.shape == (30, LENGTH, 2)
+    assert bool((found.actions.abs() <= 1).all())
+    assert found.states.tolist() == list(range(30))
+    best = order(BATCH_RULES["top"], models, states, found, 5, torch.Generator())
+    assert best.tolist() == found.scores.argsort(descending=True)[:5].tolist()
+    look = looks(states)[int(best[0])]
+    done = asked(look, found.actions[best[0]].tolist())
+    assert len(found.without(looks(states), {done}).scores) == 29
+
+
+def test_fewer_states_are_looked_at_where_chains_are_long() -> None:
+    assert states_to_look_at(DiscreteAction(7), 32) == STATES
+    assert states_to_look_at(toy_robot.ACTION, 1) == STATES
+    assert states_to_look_at(toy_robot.ACTION, 32) == IMAGINED // CHAINS // 32
 
 
 def test_of_generated_chains_the_worst_is_kept_with_its_actions(models: Models, pool: SegmentBatch) -> None:

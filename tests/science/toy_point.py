@@ -11,7 +11,8 @@ from models.segments import Segment, SegmentBatch
 from models.spaces import BoxAction, Spaces, StreamSpec
 
 SPACES = Spaces(
-    {"proprioception": StreamSpec((3,), "float32"), "objects": StreamSpec((6,), "float32")}, BoxAction(-1.0, 1.0, (3,))
+    {"proprioception": StreamSpec((3,), "float32"), "objects": StreamSpec((6,), "float32")},
+    BoxAction(-1.0, 1.0, (3,), (2,)),
 )
 STEP, DISTRACTORS = 0.1, 6
 

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from typing import get_args
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 
 from api_schemas.base import Schema
 from api_schemas.environments import (
+    GRIPPER,
     SIMULATOR_BEHAVIORS,
     SIMULATOR_SPACES,
     BoxActions,
@@ -19,6 +21,7 @@ from api_schemas.environments import (
     RobosuiteOptions,
     Spaces,
     Stream,
+    takes_robot,
 )
 from api_schemas.models import ModelKind
 from api_schemas.strategies import (
@@ -32,7 +35,9 @@ from api_schemas.strategies import (
 )
 from models.acquisition import BATCH_RULES, EXPLORING, STRATEGIES
 from models.acquisition.base import Models
+from models.families import ROBOT
 from models.network import KINDS
+from workers.data import model_spaces
 from workers.simulators import maniskill, minigrid, robosuite
 from workers.simulators.base import OptionError, SimulatorUnavailable
 from workers.simulators.catalog import SIMULATORS, behavior_names, make_simulator
@@ -87,7 +92,8 @@ def test_a_robots_spaces_are_those_of_the_simulator(name: str, task: str, camera
     assert spaces.observations == streams
     space = simulator.action_space
     assert isinstance(space, gym.spaces.Box)
-    assert spaces.actions == BoxActions(shape=space.shape, low=float(space.low.min()), high=float(space.high.max()))
+    low, high = float(space.low.min()), float(space.high.max())
+    assert spaces.actions == BoxActions(shape=space.shape, low=low, high=high, signs=(GRIPPER,))
     simulator.close()
 
 
@@ -147,6 +153,37 @@ def test_strategies_are_those_of_the_science() -> None:
 def test_a_box_of_seven_joints_is_a_space() -> None:
     spaces = Spaces(observations={"x": Stream(dtype="float32", shape=(3,))}, actions=BoxActions(shape=(7,)))
     assert Spaces.model_validate_json(spaces.model_dump_json()) == spaces
+
+
+STATE, IMAGE = Stream(dtype="float32", shape=(3,)), Stream(dtype="uint8", shape=(16, 16, 3))
+
+
+@pytest.mark.parametrize(
+    ("streams", "actions", "taken"),
+    [
+        ({"arm": STATE}, BoxActions(shape=(2,)), True),
+        ({"arm": STATE, "front": IMAGE, "wrist": IMAGE}, BoxActions(shape=(2,), low=-3.0, high=5.0, signs=(1,)), True),
+        ({"front": IMAGE}, BoxActions(shape=(2,)), True),
+        ({"front": IMAGE, "wrist": Stream(dtype="uint8", shape=(32, 32, 3))}, BoxActions(shape=(2,)), False),
+        ({"front": Stream(dtype="uint8", shape=(24, 24, 3))}, BoxActions(shape=(2,)), False),
+        ({"front": Stream(dtype="uint8", shape=(4, 4, 3))}, BoxActions(shape=(2,)), False),
+        ({"front": Stream(dtype="uint8", shape=(16, 16, 1))}, BoxActions(shape=(2,)), False),
+        ({"front": Stream(dtype="float32", shape=(16, 16, 3))}, BoxActions(shape=(2,)), False),
+        ({"arm": Stream(dtype="int64", shape=(3,))}, BoxActions(shape=(2,)), False),
+        ({"arm": Stream(dtype="float32", shape=(3, 3))}, BoxActions(shape=(2,)), False),
+        ({"arm": Stream(dtype="float64", shape=())}, BoxActions(shape=(2,)), False),
+        ({"arm": STATE}, BoxActions(shape=(2, 2)), False),
+        ({"arm": STATE}, BoxActions(shape=(2,), low=1.0, high=1.0), False),
+        ({"arm": STATE}, DiscreteActions(n=3), False),
+    ],
+)
+def test_the_robot_family_takes_what_it_says_itself(
+    streams: Mapping[str, Stream], actions: BoxActions | DiscreteActions, taken: bool
+) -> None:
+    spaces = Spaces(observations=dict(streams), actions=actions)
+    assert takes_robot(spaces) == taken
+    with nullcontext() if taken else pytest.raises(ValueError, match=r"must (all )?be|takes"):
+        ROBOT.check_spaces(model_spaces(spaces))
 
 
 def test_the_registry_tells_every_kind_of_network() -> None:

@@ -16,7 +16,7 @@ from service import jobs
 from service.store.tables import JobRow, ScoringRow
 from tests.workers.conftest import STEPS, OpenLoop, new_project
 from tests.workers.in_process import Loop
-from workers import stage
+from workers import stage, trainer
 from workers.dispatch import run_job, run_next
 from workers.stage import Stage
 from workers.training import BASE
@@ -31,7 +31,7 @@ class Slices:
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.seen: list[tuple[str, int]] = []
         self.after: dict[int, Callable[[], object]] = {}
-        patch.setattr(stage, "advance", self._advance)
+        patch.setattr(trainer, "advance", self._advance)
         patch.setattr(stage, "_next_steps", lambda *_: SLICE)
 
     def _advance(self, network: Any, batch: Any, state: TrainingState, until: int, **more: Any) -> TrainingState:
@@ -284,6 +284,6 @@ def test_a_job_that_is_always_out_of_memory_fails_and_the_queue_moves_on(labeled
         labeled.clock.advance(100)
     failed = labeled.client.round(first.id)
     assert failed.status == "failed"
-    assert "MemoryError" in str(failed.error)
+    assert "OutOfMemory: round 1, inverse_dynamics: out of memory. Lower ASIM_TRAINING_BYTES" in str(failed.error)
     assert job_of(labeled).attempts == 3
     assert labeled.train().status == "current"

@@ -12,7 +12,7 @@ from models.segments import SegmentBatch
 from models.training import TrainingState, advance
 from tests.workers.conftest import STEPS, OpenLoop
 from tests.workers.in_process import Loop
-from workers import stage, training
+from workers import stage, trainer, training
 from workers.dispatch import run_next
 
 SLICE = stage.FIRST_STEPS
@@ -25,7 +25,7 @@ class Slices:
         self.batches: list[SegmentBatch] = []
         self.steps: list[int] = []
         self.after: dict[int, Any] = {}
-        patch.setattr(stage, "advance", self._advance)
+        patch.setattr(trainer, "advance", self._advance)
         patch.setattr(stage, "_next_steps", lambda *_: SLICE)
 
     def _advance(
@@ -185,7 +185,7 @@ def test_it_follows_the_growth_of_the_pool_and_not_the_labels(trained: Loop) -> 
 
 
 def test_a_large_pool_is_thinned_out_evenly(waiting: Loop, slices: Slices, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "SUBGOAL_SEGMENTS", 200)
+    monkeypatch.setattr(training, "ACTION_FREE_SEGMENTS", 200)
     waiting.drain()
     starts = torch.tensor([segment.start for segment in slices.batches[0].segments])
     assert 200 <= len(starts) < 300

@@ -54,6 +54,18 @@ def previous_world_model(session: Session, row: RoundRow) -> ModelVersionRow | N
     return None if changed else previous
 
 
+def model_before(session: Session, row: RoundRow, kind: str, member: int) -> ModelVersionRow | None:
+    """The network of the last round before this one that was trained to its end and has one of this kind."""
+    statement = (
+        select(ModelVersionRow)
+        .join(RoundRow, RoundRow.id == ModelVersionRow.round_id)
+        .where(RoundRow.project_id == row.project_id, RoundRow.number < row.number)
+        .where(RoundRow.status.in_(("scoring", "current", "superseded")))
+        .where(ModelVersionRow.kind == kind, ModelVersionRow.member == member)
+    )
+    return session.scalar(statement.order_by(RoundRow.number.desc()).limit(1))
+
+
 def newest_model(session: Session, project_id: UUID, kind: str) -> ModelVersionRow | None:
     """The youngest network of a kind."""
     statement = select(ModelVersionRow).where(ModelVersionRow.project_id == project_id, ModelVersionRow.kind == kind)

@@ -21,6 +21,7 @@ class ProjectRow(Row):
     environment: Mapped[dict[str, object]]
     spaces: Mapped[dict[str, object]]
     family: Mapped[str | None] = mapped_column(String(40))
+    preset: Mapped[str | None] = mapped_column(String(40))
     segment_length: Mapped[int]
     stride: Mapped[int]
     held_out_fraction: Mapped[float]

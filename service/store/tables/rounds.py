@@ -53,5 +53,6 @@ class ModelVersionRow(Row):
     bytes: Mapped[int]
     watermark: Mapped[int]
     metrics: Mapped[dict[str, object]]
+    parent_id: Mapped[UUID | None] = mapped_column(ForeignKey("model_version.id"))
     created_at: Mapped[datetime]
     __table_args__ = (Index("uq_model_version_stage", "round_id", "kind", "member", unique=True),)
