@@ -46,10 +46,7 @@ def keep(session: Session, training: UUID, asked: PolicyCreate, stage: Stage, no
 
     training: the job. Returns the hash of the state that is now of no use, if there was one.
     """
-    before = with_state(queries.of_training(session, asked.project, training))
-    left = None if before is None else before.state_sha256
-    if before is not None:
-        before.state_sha256 = None
+    left = release_state(session, asked.project, training)
     row = PolicyRow(
         project_id=asked.project,
         sha256=stage.sha256,
@@ -67,6 +64,15 @@ def keep(session: Session, training: UUID, asked: PolicyCreate, stage: Stage, no
     session.merge(row)
     told: dict[str, object] = {"policy": stage.sha256, "stage": stage.number, "success": stage.success}
     events.record(session, asked.project, "policy.kept", told, now)
+    return left
+
+
+def release_state(session: Session, project_id: UUID, training: UUID) -> str | None:
+    """Nothing goes on from the training's state any more, be it over or further; its hash, if there was one."""
+    kept = with_state(queries.of_training(session, project_id, training))
+    if kept is None:
+        return None
+    left, kept.state_sha256 = kept.state_sha256, None
     return left
 
 
