@@ -7,7 +7,7 @@ from sqlalchemy.orm import Session
 
 from api_schemas.jobs import TrainRound
 from service import jobs, policies, rounds, scorings
-from service.errors import JobFinished
+from service.jobs import JobFinished
 from service.store.queries import acquisitions as acquisition_queries
 from service.store.queries import jobs as job_queries
 from service.store.tables import JobRow

@@ -11,9 +11,18 @@ from api_schemas.environments import DiscreteActions, takes_images
 from api_schemas.jobs import TrainPolicy
 from api_schemas.policies import PREFIX, Policy, PolicyCreate
 from service import events, jobs, projects
-from service.errors import InvalidField, NoSimulator, UnknownBehavior, UnknownResource
+from service.errors import InvalidField, NoSimulator, ServiceError, UnknownBehavior, UnknownResource
 from service.store.queries import policies as queries
 from service.store.tables import JobRow, PolicyRow, ProjectRow
+
+
+class PoliciesOutOfReach(ServiceError):
+    """The store of policies' weights is not in reach of this process."""
+
+    status_code = 404
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}: weights of policies are in the provenance store, which is not in reach here")
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,10 @@
 
 from sqlalchemy.orm import Session
 
-from service.errors import CorruptBlob, MissingBlob, ServiceError
+from service.errors import ServiceError
 from service.log import get_logger
 from service.store.blobs import Blobs
+from service.store.errors import CorruptBlob, MissingBlob
 from service.store.tables import JobRow
 from workers.job import RunningJob
 

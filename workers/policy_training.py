@@ -17,9 +17,9 @@ from models.segments import SegmentBatch
 from models.spaces import BoxAction, Spaces, StreamSpec
 from models.training import Progress, TrainingState, advance, begin
 from service import jobs, policies, projects
-from service.errors import CorruptBlob, MissingBlob, PoliciesOutOfReach
 from service.log import get_logger
-from service.policies import Stage
+from service.policies import PoliciesOutOfReach, Stage
+from service.store.errors import CorruptBlob, MissingBlob
 from service.store.provenance import ProvenanceBlobs
 from service.store.queries import policies as queries
 from service.store.tables import PolicyRow
