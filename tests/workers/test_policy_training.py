@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import replace
 from datetime import timedelta
 from typing import Any
 
@@ -18,12 +17,11 @@ from asim.client import Client
 from asim.errors import AsimError, Conflict, Invalid, NotFound
 from asim.policy_parts import parts_of
 from models import checkpoints
-from models.policies.diffusion import training_config
-from models.spaces import Spaces
-from models.training import TrainingConfig, advance
+from models.training import advance
 from service.clock import utc_now
 from service.garbage import collect
 from service.store.provenance import ProvenanceBlobs
+from tests.workers.brief_policies import brief
 from tests.workers.conftest import OpenLoop
 from tests.workers.in_process import Loop
 from tests.workers.test_robot_collection import project_of
@@ -41,10 +39,7 @@ STAGES, STEPS = 3, 100
 
 @pytest.fixture(autouse=True)
 def _short_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    def short(spaces: Spaces) -> TrainingConfig:
-        return replace(training_config(spaces), steps=STEPS, batch_size=8)
-
-    monkeypatch.setattr(policy_training, "training_config", short)
+    monkeypatch.setattr(policy_training, "training_config", brief(STEPS))
     monkeypatch.setattr(policy_training, "TRIALS", 1)
 
 
