@@ -14,10 +14,10 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service import canary, keys
 from service.carrier import impatient_app
-from service.errors import BlobsUnavailable, CorruptBlob, MissingBlob
 from service.settings import Settings
 from service.store.blobs import Blobs
 from service.store.database import Database, newest_revision, open_database, revision_of
+from service.store.errors import BlobsUnavailable, CorruptBlob, MissingBlob
 from service.store.provenance import open_provenance
 from service.store.queries import jobs as job_queries
 from service.store.queries import pool as pool_queries

@@ -14,8 +14,10 @@ from api_schemas.projects import Budget
 from api_schemas.strategies import STRATEGY_NAMES
 from service import draws, events, leases, projects, proposals, scorings
 from service.clock import Clock
-from service.draws import Candidate
-from service.errors import BudgetExhausted, NothingToExplore, PoolExhausted, UnknownStrategy
+from service.draws import Candidate, PoolExhausted
+from service.errors import UnknownStrategy
+from service.leases import BudgetExhausted
+from service.proposals import NothingToExplore
 from service.store.queries import acquisitions as queries
 from service.store.queries import pool as pool_queries
 from service.store.queries.acquisitions import Queued

@@ -17,11 +17,10 @@ from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
 from api_schemas.base import Schema, Timestamp
-from service.errors import CorruptBlob, MissingBlob
 from service.store import transfer
 from service.store.blobs import Blobs
 from service.store.database import revision_of
-from service.store.errors import BackupExists, UnreadableBackup
+from service.store.errors import BackupExists, CorruptBlob, MissingBlob, UnreadableBackup
 from service.store.provenance import ProvenanceBlobs
 from service.store.queries.references import PROVENANCE, Reference, references
 

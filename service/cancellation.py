@@ -1,4 +1,4 @@
-"""Cancelling a job, with what follows for the round or scoring that it works on."""
+"""Cancelling a job, with what follows for the round, scoring or policy that it works on."""
 
 from datetime import datetime
 from uuid import UUID
@@ -6,8 +6,8 @@ from uuid import UUID
 from sqlalchemy.orm import Session
 
 from api_schemas.jobs import TrainRound
-from service import jobs, rounds, scorings
-from service.errors import JobFinished
+from service import jobs, policies, rounds, scorings
+from service.jobs import JobFinished
 from service.store.queries import acquisitions as acquisition_queries
 from service.store.queries import jobs as job_queries
 from service.store.tables import JobRow
@@ -16,7 +16,8 @@ from service.store.tables import JobRow
 def cancel(session: Session, job_id: UUID, now: datetime) -> JobRow:
     """Stop a job for good: a worker that runs it is told by its next heartbeat, and nothing it writes is taken.
 
-    Its round is cancelled, its scoring failed. Cancelled already, it stays so. Raises UnknownResource, JobFinished.
+    Its round is cancelled, its scoring failed, the state of its policy released. Cancelled already, it stays so. Raises
+    UnknownResource, JobFinished.
     """
     _check_successor(session, jobs.find(session, job_id))
     row = jobs.cancel(session, job_id, now)
@@ -24,6 +25,8 @@ def cancel(session: Session, job_id: UUID, now: datetime) -> JobRow:
         rounds.cancel(session, row.subject_id, now)
     elif row.kind == "propose_explorations":
         scorings.fail(session, row.subject_id, now)
+    elif row.kind == "train_policy":
+        policies.release_state(session, row.subject_id, row.id)
     elif row.kind in ("score_shard", "merge_scores"):
         _cancel_scoring(session, row.subject_id, now)
     return row

@@ -11,8 +11,20 @@ from sqlalchemy.orm import Session
 from api_schemas.environments import DiscreteActions
 from api_schemas.labels import Action
 from service import projects
+from service.errors import ServiceError
 from service.store.queries import pool as queries
 from service.store.tables import ProjectRow
+
+
+class PoolExhausted(ServiceError):
+    """The pool has no segment left to give."""
+
+    status_code = 409
+
+    def __init__(self, asked: int, unlabeled: int, purpose: str) -> None:
+        super().__init__(
+            f"count: asked for {asked} segments, {unlabeled} are unlabeled and free in the {purpose} split"
+        )
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ from uuid import UUID
 from sqlalchemy.orm import Session
 
 from service import events, leases
-from service.errors import InvalidField, LeaseLost
+from service.errors import InvalidField
+from service.leases import LeaseLost
 from service.store.queries import acquisitions as queries
 from service.store.tables import AcquisitionItemRow, AcquisitionRow, ProjectRow
 

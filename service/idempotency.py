@@ -5,9 +5,22 @@ from datetime import datetime, timedelta
 
 from sqlalchemy.orm import Session
 
-from service.errors import IdempotencyKeyReused
+from api_schemas.errors import InvalidParam
+from service.errors import ServiceError
 from service.store.queries import idempotency as queries
 from service.store.tables import IdempotencyRow
+
+
+class IdempotencyKeyReused(ServiceError):
+    """An Idempotency-Key stands for one request."""
+
+    status_code = 422
+
+    def __init__(self, key: str, route: str) -> None:
+        reason = f"was used for another body of {route}"
+        super().__init__(
+            f"Idempotency-Key: {key!r} {reason}", [InvalidParam(name="Idempotency-Key", reason=reason, value=key)]
+        )
 
 
 @dataclass(frozen=True)

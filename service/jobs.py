@@ -15,12 +15,31 @@ from sqlalchemy.orm import Session
 from api_schemas.jobs import PRIORITIES, QUEUES, Canary, Job, JobPayload
 from service import events, origin
 from service.clock import Clock
-from service.errors import JobFinished, JobLost, UnknownResource
+from service.errors import ServiceError, UnknownResource
 from service.store.queries import jobs as queries
 from service.store.tables import JobRow, WorkerRow
 
 PAYLOADS: TypeAdapter[JobPayload] = TypeAdapter(JobPayload)
 RETRY_SECONDS = (1.0, 5.0, 20.0, 60.0)  # before the second, third, ... attempt of a job that failed
+
+
+class JobFinished(ServiceError):
+    """A job that has ended cannot be cancelled."""
+
+    status_code = 409
+
+    def __init__(self, job: UUID, state: str, successor: UUID | None = None) -> None:
+        left = f"its round goes on in job {successor}" if successor else "there is nothing left to cancel"
+        super().__init__(f"job {job} is {state}; {left}")
+
+
+class JobLost(ServiceError):
+    """Another worker holds this job by now; what this one did is not stored."""
+
+    status_code = 409
+
+    def __init__(self, job: UUID, fence: int) -> None:
+        super().__init__(f"job {job}: fence {fence} is not the current one")
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,15 @@ from sqlalchemy.orm import Session
 
 from api_schemas.keys import Key, KeyCreate, KeyCreated
 from service import events, projects
-from service.errors import InvalidField, Unauthenticated, UnknownResource
+from service.errors import InvalidField, ServiceError, UnknownResource
 from service.store.tables import KeyRow
+
+
+class Unauthenticated(ServiceError):
+    """A valid API key is needed."""
+
+    status_code = 401
+    headers = {"WWW-Authenticate": "Bearer"}
 
 
 def create(session: Session, request: KeyCreate, now: datetime) -> KeyCreated:

@@ -21,17 +21,10 @@ from api_schemas.labels import (
 )
 from api_schemas.trajectories import SplitChoice
 from service import events, explorations, leases, pool, projects, rounds
-from service.actions import check_actions
+from service.actions import InvalidLabel, LabelConflict, check_actions
 from service.clock import Clock
-from service.errors import (
-    InvalidField,
-    InvalidLabel,
-    InvalidLeaseToken,
-    LabelConflict,
-    LeaseLost,
-    SegmentLeased,
-    UnknownResource,
-)
+from service.errors import InvalidField, UnknownResource
+from service.leases import InvalidLeaseToken, LeaseLost, SegmentLeased
 from service.pool import StoredTrajectory
 from service.store.queries import acquisitions as claim_queries
 from service.store.queries import labels as queries

@@ -7,7 +7,7 @@ from sqlalchemy.orm import Session
 
 from service import events, projects
 from service.clock import Clock
-from service.errors import BudgetExhausted, InvalidLeaseToken, LeaseLost, UnknownResource
+from service.errors import ServiceError, UnknownResource
 from service.store.queries import acquisitions as queries
 from service.store.queries import pool as pool_queries
 from service.store.queries import rows
@@ -15,6 +15,43 @@ from service.store.tables import AcquisitionRow, ProjectRow
 
 OPEN = ("leased", "expired")  # an expired lease may still be extended or answered while nobody has taken its segments
 SWEPT = 200  # expired leases noted at a time
+
+
+class BudgetExhausted(ServiceError):
+    """The project's label budget does not cover this."""
+
+    status_code = 409
+
+    def __init__(self, asked: int, remaining: int, total: int) -> None:
+        super().__init__(f"count: asked for {asked} segments, {remaining} of the budget of {total} labels remain")
+
+
+class InvalidLeaseToken(ServiceError):
+    """The token is not the one that this acquisition was given."""
+
+    status_code = 403
+
+    def __init__(self, acquisition: UUID, token: int | None) -> None:
+        given = "no token was sent" if token is None else f"{token} is not it"
+        super().__init__(f"token: acquisition {acquisition} needs the token of its lease; {given}")
+
+
+class LeaseLost(ServiceError):
+    """The lease has ended and cannot be used any more."""
+
+    status_code = 410
+
+    def __init__(self, acquisition: UUID, reason: str) -> None:
+        super().__init__(f"acquisition {acquisition}: {reason}")
+
+
+class SegmentLeased(ServiceError):
+    """Somebody else holds the segment."""
+
+    status_code = 423
+
+    def __init__(self, trajectory: str, start: int, until: datetime) -> None:
+        super().__init__(f"segment {trajectory}:{start} is leased to another labeler until {until.isoformat()}")
 
 
 def find(session: Session, acquisition_id: UUID) -> AcquisitionRow:

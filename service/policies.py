@@ -11,9 +11,18 @@ from api_schemas.environments import DiscreteActions, takes_images
 from api_schemas.jobs import TrainPolicy
 from api_schemas.policies import PREFIX, Policy, PolicyCreate
 from service import events, jobs, projects
-from service.errors import InvalidField, NoSimulator, UnknownBehavior, UnknownResource
+from service.errors import InvalidField, NoSimulator, ServiceError, UnknownBehavior, UnknownResource
 from service.store.queries import policies as queries
 from service.store.tables import JobRow, PolicyRow, ProjectRow
+
+
+class PoliciesOutOfReach(ServiceError):
+    """The store of policies' weights is not in reach of this process."""
+
+    status_code = 404
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}: weights of policies are in the provenance store, which is not in reach here")
 
 
 @dataclass(frozen=True)
@@ -46,10 +55,7 @@ def keep(session: Session, training: UUID, asked: PolicyCreate, stage: Stage, no
 
     training: the job. Returns the hash of the state that is now of no use, if there was one.
     """
-    before = with_state(queries.of_training(session, asked.project, training))
-    left = None if before is None else before.state_sha256
-    if before is not None:
-        before.state_sha256 = None
+    left = release_state(session, asked.project, training)
     row = PolicyRow(
         project_id=asked.project,
         sha256=stage.sha256,
@@ -67,6 +73,15 @@ def keep(session: Session, training: UUID, asked: PolicyCreate, stage: Stage, no
     session.merge(row)
     told: dict[str, object] = {"policy": stage.sha256, "stage": stage.number, "success": stage.success}
     events.record(session, asked.project, "policy.kept", told, now)
+    return left
+
+
+def release_state(session: Session, project_id: UUID, training: UUID) -> str | None:
+    """Nothing goes on from the training's state any more, be it over or further; its hash, if there was one."""
+    kept = with_state(queries.of_training(session, project_id, training))
+    if kept is None:
+        return None
+    left, kept.state_sha256 = kept.state_sha256, None
     return left
 
 

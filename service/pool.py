@@ -11,11 +11,29 @@ from sqlalchemy.orm import Session
 from api_schemas.environments import Spaces, Stream
 from api_schemas.trajectories import SplitChoice, Trajectory, TrajectoryReceipt
 from service import events, streams
-from service.errors import SplitConflict, UnknownResource
+from service.errors import ServiceError, UnknownResource
 from service.store import codec
 from service.store.blobs import Blobs
 from service.store.queries import pool as queries
 from service.store.tables import MembershipRow, ProjectRow, TrajectoryRow
+
+
+class SplitConflict(ServiceError):
+    """The trajectory is in the other split of this project."""
+
+    status_code = 409
+
+    def __init__(self, trajectory: str, split: str, asked: str) -> None:
+        super().__init__(f"split: trajectory {trajectory} is in the split {split!r} of this project, not in {asked!r}")
+
+
+class NoProvenance(ServiceError):
+    """No simulator states are kept for this trajectory, or not in reach of this process."""
+
+    status_code = 404
+
+    def __init__(self, trajectory: str) -> None:
+        super().__init__(f"trajectory {trajectory} has no provenance here")
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,14 @@ was given out under the round's models, or came back labeled under any.
 
 from collections.abc import Sequence
 from datetime import datetime
+from uuid import UUID
 
 from sqlalchemy.orm import Session
 
 from api_schemas.jobs import ProposeExplorations, TrainRound
 from api_schemas.strategies import CATALOG
 from service import draws, jobs, projects, scorings
-from service.errors import AllExplored, NothingToExplore
+from service.errors import ServiceError
 from service.scorings import NEEDS, PREVIOUS, Limits
 from service.store.queries import acquisitions as queries
 from service.store.queries import jobs as job_queries
@@ -22,6 +23,28 @@ from service.store.tables import JobRow, ModelVersionRow, ProjectRow, QueueRow, 
 
 EXPLORING = frozenset(strategy.name for strategy in CATALOG if strategy.explores)
 GENERATOR = "subgoal_generator"
+
+
+class NothingToExplore(ServiceError):
+    """The pool holds no state to explore from."""
+
+    status_code = 409
+
+    def __init__(self, project: UUID, simulator: str | None) -> None:
+        missing = "trajectory" if simulator is None else f"trajectory whose states in {simulator} are kept"
+        super().__init__(f"mode: project {project} has no {missing} in its pool that an exploration could start from")
+
+
+class AllExplored(ServiceError):
+    """What a strategy can propose under a round's models has all been given out."""
+
+    status_code = 409
+
+    def __init__(self, project: UUID, strategy: str, round_number: int) -> None:
+        super().__init__(
+            f"mode: all that {strategy} finds to explore in the pool of project {project} under the models of round "
+            f"{round_number} has been given out; more comes with the next round or with more trajectories"
+        )
 
 
 def proposing(session: Session, project: ProjectRow, strategy: str) -> RoundRow | None:

@@ -4,7 +4,7 @@ from datetime import datetime, timedelta
 
 from sqlalchemy.orm import Session
 
-from service import jobs, leases, origin, rounds, scorings
+from service import jobs, leases, origin, policies, rounds, scorings
 from service.store.database import Database
 from service.store.queries import idempotency as idempotency_queries
 from service.store.queries import jobs as job_queries
@@ -29,12 +29,14 @@ def reap(database: Database, now: datetime) -> None:
 
 
 def give_up(session: Session, row: JobRow, now: datetime) -> None:
-    """A round or scoring whose job has failed for good has failed too."""
+    """A round or scoring whose job has failed for good has failed too; from a policy's state nobody goes on."""
     error = f"job {row.id} ({row.kind}): {row.error}"
     if row.kind == "train_round":
         rounds.fail(session, row.subject_id, error, now)
     elif row.kind == "propose_explorations":
         scorings.fail(session, row.subject_id, now)
+    elif row.kind == "train_policy":
+        policies.release_state(session, row.subject_id, row.id)
     elif row.kind in ("score_shard", "merge_scores"):
         scorings.fail(session, row.subject_id, now)
         round_id = scorings.find(session, row.subject_id).round_id

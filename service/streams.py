@@ -7,11 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from api_schemas.environments import Spaces, Stream
-from service.errors import ForeignFile, InvalidTrajectory
+from service.errors import InvalidField
+from service.store.errors import ForeignFile
 from service.store.npz import NpzFile
 
 Arrays = dict[str, NDArray[Any]]
 BLOCK_NUMBERS = 2**20  # looked at together: a mask of a whole stream would double what the stream takes
+
+
+class InvalidTrajectory(InvalidField):
+    """A trajectory does not fit the project's observation space, or its arrays disagree."""
 
 
 class Shaped(Protocol):

@@ -15,9 +15,9 @@ from asim.client import Client
 from asim.errors import NotFound
 from workers.delivery import Answer
 from workers.explainers import Explainer, explainer_of
-from workers.recording import Arrays, Known, Provenance, Recording
+from workers.recording import Known, Provenance, Recording, stacked
 from workers.replay import Behaviors
-from workers.simulators.base import Observation, Simulator, SimulatorError, State
+from workers.simulators.base import Simulator, SimulatorError
 from workers.simulators.catalog import make_behavior, make_simulator
 from workers.unanswerable import EndedEarly, SimulatorFailed, UnexplainedStep
 
@@ -131,7 +131,7 @@ def _explore(
     executed = list(actions[: len(seen) - 1])
     if len(executed) < project.segment_length:  # the service would refuse it, and with it the request that it is in
         raise EndedEarly(item, len(executed), project.segment_length)
-    recording = Recording(item.trajectory, item.start, _stacked(seen), _stacked(passed))
+    recording = Recording(item.trajectory, item.start, stacked(seen), stacked(passed))
     sets = []
     for number, action in enumerate(executed):
         found = explainer.confirm(recording, number, action)
@@ -151,7 +151,3 @@ def _explore(
 def _action_sets(explainer: Explainer, sets: Sequence[list[Any]]) -> list[list[int]] | None:
     """Only where they hold all actions that explain a step."""
     return list(sets) if explainer.is_exhaustive else None
-
-
-def _stacked(steps: Sequence[Observation | State]) -> Arrays:
-    return {name: np.stack([step[name] for step in steps]) for name in steps[0]}

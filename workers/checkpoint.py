@@ -2,8 +2,10 @@
 
 from sqlalchemy.orm import Session
 
-from service.errors import CorruptBlob, MissingBlob, ServiceError
+from service.errors import ServiceError
 from service.log import get_logger
+from service.store.blobs import Blobs
+from service.store.errors import CorruptBlob, MissingBlob
 from service.store.tables import JobRow
 from workers.job import RunningJob
 
@@ -49,9 +51,14 @@ class Checkpoint:
 
     def discard(self, sha256: str | None) -> None:
         """Delete what no row refers to any more."""
-        if sha256 is None:
-            return
-        try:
-            self._job.worker.blobs.delete("checkpoints", sha256)
-        except (ServiceError, OSError) as error:  # it only takes up room
-            log.warning("checkpoint_not_deleted", sha256=sha256, error=str(error))
+        delete_unneeded(self._job.worker.blobs, "checkpoints", sha256)
+
+
+def delete_unneeded(store: Blobs, kind: str, sha256: str | None) -> None:
+    """Delete a blob that no row refers to any more, if there is one."""
+    if sha256 is None:
+        return
+    try:
+        store.delete(kind, sha256)
+    except (ServiceError, OSError) as error:  # it only takes up room
+        log.warning("blob_not_deleted", kind=kind, sha256=sha256, error=str(error))

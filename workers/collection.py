@@ -14,8 +14,8 @@ from api_schemas.environments import DEFAULT_BEHAVIORS, DiscreteActions
 from api_schemas.jobs import Collect
 from api_schemas.labels import LabelSource, LabelsRequest
 from service import labels, pool, projects
-from service.errors import NoProvenance
 from service.labels import LabeledUpload
+from service.pool import NoProvenance
 from service.store import codec
 from service.store.provenance import ProvenanceBlobs
 from service.store.queries import pool as pool_queries

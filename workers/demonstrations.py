@@ -8,6 +8,7 @@ import torch
 
 from models.segments import Segment, SegmentBatch
 from workers.policies import Form, look
+from workers.recording import stacked
 from workers.rollouts import Rollout, rollout
 from workers.simulators.base import Action, Behavior, Simulator, SimulatorError
 from workers.simulators.catalog import make_behavior
@@ -71,9 +72,8 @@ def segments(demonstrations: list[Rollout], chunk: int) -> SegmentBatch:
     for number, episode in enumerate(demonstrations):
         now = np.arange(len(episode.actions))
         before, ahead = np.maximum(now - 1, 0), np.minimum(now[:, None] + np.arange(chunk), now[-1])
-        for name, parts in observations.items():
-            stream = np.stack([seen[name] for seen in episode.seen])
-            parts.append(torch.from_numpy(np.stack([stream[before], stream[now]], 1)))
+        for name, stream in stacked(episode.seen).items():
+            observations[name].append(torch.from_numpy(np.stack([stream[before], stream[now]], 1)))
         actions.append(torch.from_numpy(np.stack(episode.actions)[ahead])[:, None])  # (T, chunk, D) -> (T, 1, chunk, D)
         names += [Segment(f"demonstration {number}", int(step)) for step in now]
     seen = {name: torch.cat(parts) for name, parts in observations.items()}

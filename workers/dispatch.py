@@ -22,11 +22,12 @@ from api_schemas.jobs import (
     TrainSubgoalGenerator,
 )
 from service import canary, jobs, origin, reaper, traces
-from service.errors import BlobsUnavailable, JobLost
+from service.jobs import JobLost
 from service.log import get_logger
 from service.settings import Settings
 from service.store.blobs import Blobs
 from service.store.database import open_database
+from service.store.errors import BlobsUnavailable
 from service.store.tables import JobRow
 from workers.job import GaveWay, Heartbeat, RunningJob, Worker
 from workers.watchdog import Watchdog

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workers.explanation import explain
+from workers.recording import stacked
 from workers.simulators.base import Behavior, Simulator
 
 DIGEST = 16  # bytes that stand for an episode: a checkpoint holds one for each
@@ -139,7 +140,7 @@ def _episode(
         on_step()
         if step.terminated or step.truncated:
             break
-    return Episode(_stacked(observations), _stacked(states), actions, seed, generator)
+    return Episode(stacked(observations), stacked(states), actions, seed, generator)
 
 
 def _digest(episode: Episode) -> bytes:
@@ -148,8 +149,3 @@ def _digest(episode: Episode) -> bytes:
     for name in sorted(episode.observations):
         digest.update(episode.observations[name].tobytes())
     return digest.digest()[:DIGEST]
-
-
-def _stacked(steps: list[dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """T + 1 dicts of arrays to one dict of arrays (T + 1, ...)."""
-    return {name: np.stack([step[name] for step in steps]) for name in steps[0]}

@@ -13,7 +13,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from service import jobs
-from service.errors import JobLost
+from service.jobs import JobLost
 from service.log import get_logger
 from service.settings import Settings
 from service.store.blobs import Blobs

@@ -11,6 +11,7 @@ from models import checkpoints
 from models.policies.diffusion import HISTORY, DiffusionPolicy
 from models.policies.noise import DiffusersMissing, training_scheduler
 from models.segments import Observations
+from workers.recording import stacked
 from workers.simulators.base import (
     ArrangedSimulator,
     Behavior,
@@ -88,4 +89,4 @@ class PolicyBehavior:
     def _history(self) -> Observations:
         """What was seen last, (1, HISTORY, ...): before the first action the same twice."""
         steps = [self._seen[0]] * (HISTORY - len(self._seen)) + list(self._seen)
-        return {name: torch.from_numpy(np.stack([step[name] for step in steps]))[None] for name in steps[0]}
+        return {name: torch.from_numpy(stream)[None] for name, stream in stacked(steps).items()}

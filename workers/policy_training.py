@@ -17,12 +17,13 @@ from models.segments import SegmentBatch
 from models.spaces import BoxAction, Spaces, StreamSpec
 from models.training import Progress, TrainingState, advance, begin
 from service import jobs, policies, projects
-from service.errors import CorruptBlob, MissingBlob, PoliciesOutOfReach, ServiceError
 from service.log import get_logger
-from service.policies import Stage
+from service.policies import PoliciesOutOfReach, Stage
+from service.store.errors import CorruptBlob, MissingBlob
 from service.store.provenance import ProvenanceBlobs
 from service.store.queries import policies as queries
 from service.store.tables import PolicyRow
+from workers.checkpoint import delete_unneeded
 from workers.demonstrations import FIRST_OTHER, demonstrate, segments
 from workers.job import RunningJob
 from workers.policies import PolicyBehavior, check_installed, policy_of
@@ -129,8 +130,7 @@ def _keep(
     with job.transaction() as session:
         left = policies.keep(session, job.lease.job_id, asked, stage, job.now())
         jobs.made_progress(session, job.lease)
-    if left is not None:
-        _discard(provenance, left)
+    delete_unneeded(provenance, "trainings", left)
 
 
 def _kept(job: RunningJob, asked: PolicyCreate) -> Sequence[PolicyRow]:
@@ -155,10 +155,3 @@ def _resumed(
         return None
     log.info("training_resumed", stage=kept.stage, step=state.step)
     return state
-
-
-def _discard(provenance: ProvenanceBlobs, sha256: str) -> None:
-    try:
-        provenance.delete("trainings", sha256)
-    except (ServiceError, OSError) as error:  # nothing refers to it any more: it only takes up room
-        log.warning("training_not_deleted", sha256=sha256, error=str(error))

@@ -1,14 +1,20 @@
 """Recordings: what a labeler has of a segment, and of the trajectory that it is in."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from workers.simulators.base import Observation, State
 
 Arrays = dict[str, NDArray[Any]]
+
+
+def stacked(steps: Sequence[Mapping[str, NDArray[Any]]]) -> Arrays:
+    """What was observed, or the states, at T moments: T dicts of arrays (...) to one of arrays (T, ...)."""
+    return {name: np.stack([step[name] for step in steps]) for name in steps[0]}
 
 
 class Provenance(NamedTuple):

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from api_schemas.jobs import Collect
-from service.errors import ForeignFile
 from service.store import codec
+from service.store.errors import ForeignFile
 from workers.episodes import DIGEST, Drawn
 from workers.simulators.base import Behavior, RememberingBehavior
 

@@ -8,17 +8,16 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.store import codec
+from workers.recording import Arrays, stacked
 from workers.simulators.catalog import make_behavior, make_simulator
 
 EPISODES, STEPS = 8, 100
 SIMULATOR, TASK, BEHAVIOR = "maniskill", "PokeCube", "noisy_expert"
-Arrays = dict[str, NDArray[Any]]
 
 
 class Written(NamedTuple):
@@ -73,4 +72,4 @@ def _rendered() -> Iterator[Arrays]:
             behavior.reset(rng)
             while len(seen) <= STEPS:
                 seen.append(simulator.step(behavior.act(simulator, rng)).observation)
-            yield {name: np.stack([each[name] for each in seen]) for name in seen[0]}
+            yield stacked(seen)

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models.networks.image_encoder import ImageEncoder, shifted
 from models.networks.initialisation import initialise
 from models.networks.mlp import Mlp
 from models.networks.temporal_unet import TemporalUnet, step_embedding
+from models.policies.camera_encoder import CameraEncoder, shifted
 from models.policies.noise import acting_scheduler, training_scheduler
 from models.segments import Observations, SegmentBatch
 from models.spaces import BoxAction, Spaces
@@ -79,7 +79,7 @@ class DiffusionPolicy(nn.Module):
         self.register_buffer("mean", torch.zeros(numbers))
         self.register_buffer("deviation", torch.ones(numbers))
         self.encoders = nn.ModuleDict(
-            {name: ImageEncoder(streams[name].shape, config.image_channels, config.features) for name in self.images}
+            {name: CameraEncoder(streams[name].shape, config.image_channels, config.features) for name in self.images}
         )
         inputs = HISTORY * (numbers + len(self.images) * config.features)
         self.mix = Mlp((inputs, 2 * config.features, config.features))

@@ -16,7 +16,8 @@ from sqlalchemy import select
 
 from api_schemas.keys import Key, Scope
 from service.api.dependencies import Services, ServicesDep
-from service.errors import InvalidField, NotAllowed, Unauthenticated, UnknownResource
+from service.errors import InvalidField, ServiceError, UnknownResource
+from service.keys import Unauthenticated
 from service.store.tables import AcquisitionRow, JobRow, ModelVersionRow, RoundRow
 
 LONGEST_ACTOR = 200
@@ -24,6 +25,12 @@ NO_KEY = "authorization: send an API key as `Authorization: Bearer KEY`"
 _bearer = HTTPBearer(auto_error=False, description="an API key; embedded mode needs none from this machine")
 Credentials = Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)]
 OfOneProject = type[AcquisitionRow] | type[JobRow] | type[ModelVersionRow] | type[RoundRow]
+
+
+class NotAllowed(ServiceError):
+    """The key does not allow this."""
+
+    status_code = 403
 
 
 @dataclass(frozen=True)

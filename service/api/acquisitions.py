@@ -13,20 +13,12 @@ from service.api.access import By, CallerDep, by_body, requires
 from service.api.dependencies import Now, ReadSession, Services, ServicesDep, WriteSession
 from service.api.description import refuses
 from service.api.once import Answer, IdempotencyKey, Prefer, answered_once, key_use, wait_seconds
-from service.errors import (
-    AllExplored,
-    BudgetExhausted,
-    IdempotencyKeyReused,
-    InvalidLeaseToken,
-    KeyBusy,
-    LeaseLost,
-    NoModelFamily,
-    NothingToExplore,
-    PoolExhausted,
-    PrivilegedStrategy,
-    UnknownStrategy,
-)
-from service.idempotency import KeyUse
+from service.draws import PoolExhausted
+from service.errors import NoModelFamily, PrivilegedStrategy, UnknownStrategy
+from service.idempotency import IdempotencyKeyReused, KeyUse
+from service.leases import BudgetExhausted, InvalidLeaseToken, LeaseLost
+from service.proposals import AllExplored, NothingToExplore
+from service.store.errors import KeyBusy
 from service.store.tables import AcquisitionRow, JobRow
 
 router = APIRouter(tags=["acquisitions"])

@@ -14,9 +14,21 @@ from limits import RateLimitItem
 from limits.storage import MemoryStorage
 from limits.strategies import MovingWindowRateLimiter
 
-from service.errors import TooManyFailedKeys
+from service.errors import ServiceError
 
 MOST_GOOD = 1_000
+
+
+class TooManyFailedKeys(ServiceError):
+    """Too many API keys that open nothing came from here."""
+
+    status_code = 429
+
+    def __init__(self, failures: int, seconds: int) -> None:
+        super().__init__(
+            f"authorization: {failures} keys of this machine failed within a minute; try again in {seconds} s"
+        )
+        self.headers = {"Retry-After": str(seconds)}
 
 
 class FailedKeys:

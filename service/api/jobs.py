@@ -12,7 +12,8 @@ from service import cancellation, events, jobs, projects
 from service.api.access import By, CallerDep, by_query, narrowed, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, WriteSession
 from service.api.description import refuses
-from service.errors import JobFinished, UnknownResource
+from service.errors import UnknownResource
+from service.jobs import JobFinished
 from service.store.queries.events import ORDER, settled
 from service.store.queries.listing import page
 from service.store.tables import EventRow, JobRow

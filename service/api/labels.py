@@ -10,29 +10,20 @@ from api_schemas.base import Page
 from api_schemas.environments import Spaces
 from api_schemas.labels import MOST_SEGMENTS, Label, LabelsAccepted, LabelsRequest
 from service import labels, pool, projects, streams
-from service.actions import check_actions
+from service.actions import InvalidLabel, LabelConflict, check_actions
 from service.api.access import CallerDep, by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, Services, ServicesDep
 from service.api.description import refuses
 from service.api.once import Answer, IdempotencyKey, answered_once, kept_answer, key_use
-from service.errors import (
-    BlobsUnavailable,
-    ForeignFile,
-    IdempotencyKeyReused,
-    InvalidField,
-    InvalidLabel,
-    InvalidLeaseToken,
-    InvalidTrajectory,
-    KeyBusy,
-    LabelConflict,
-    LeaseLost,
-    SegmentLeased,
-    SplitConflict,
-)
-from service.idempotency import KeyUse
+from service.errors import InvalidField
+from service.idempotency import IdempotencyKeyReused, KeyUse
 from service.labels import LabeledUpload
+from service.leases import InvalidLeaseToken, LeaseLost, SegmentLeased
+from service.pool import SplitConflict
+from service.store.errors import BlobsUnavailable, ForeignFile, KeyBusy
 from service.store.queries.listing import page
 from service.store.tables import LabelRow, ProjectRow
+from service.streams import InvalidTrajectory
 
 router = APIRouter(prefix="/labels", tags=["labels"])
 

@@ -11,7 +11,9 @@ from service import jobs, policies, projects
 from service.api.access import by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
 from service.api.description import refuses
-from service.errors import BlobsUnavailable, NoSimulator, PoliciesOutOfReach
+from service.errors import NoSimulator
+from service.policies import PoliciesOutOfReach
+from service.store.errors import BlobsUnavailable
 from service.store.queries.listing import page
 from service.store.tables import PolicyRow
 

@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException
 from api_schemas.errors import PROBLEM_JSON, InvalidParam, Problem
 from service.api.description import methods
 from service.api.headers import CORRELATION, HEADERS
-from service.errors import LONGEST, RETRY_SOON, BodyTooLarge, ServiceError
+from service.errors import LONGEST, RETRY_SOON, ServiceError
 from service.log import get_logger
 
 log = get_logger("api")
@@ -24,6 +24,12 @@ BRIEFLY.maxlevel, BRIEFLY.maxdict, BRIEFLY.maxlist, BRIEFLY.maxtuple = 4, 20, 20
 BRIEFLY.maxstring = BRIEFLY.maxother = LONGEST
 # A database that is down, full or slow; "internal" is what PostgreSQL calls that it ended an idle transaction.
 OUTAGES = (OperationalError, InterfaceError, InternalError, PoolTimeout)
+
+
+class BodyTooLarge(ServiceError):
+    """The request is larger than this service takes."""
+
+    status_code = 413
 
 
 def install(app: FastAPI) -> None:

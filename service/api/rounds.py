@@ -13,7 +13,8 @@ from service import projects, registry, rounds
 from service.api.access import By, by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
 from service.api.description import refuses
-from service.errors import BlobsUnavailable, NoModelFamily, NothingToLearn
+from service.errors import NoModelFamily, NothingToLearn
+from service.store.errors import BlobsUnavailable
 from service.store.queries.listing import page
 from service.store.tables import ModelVersionRow, RoundRow
 

@@ -23,7 +23,9 @@ from service.api.attempts import FailedKeys
 from service.api.dependencies import Services
 from service.api.gathering import gathered
 from service.api.headers import CORRELATION, HEADERS
-from service.errors import BodyTooLarge, CrossOrigin, ServiceError, Unauthenticated
+from service.api.problems import BodyTooLarge
+from service.errors import ServiceError
+from service.keys import Unauthenticated
 from service.settings import Settings
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -39,6 +41,12 @@ FORWARDED = (  # a proxy of this machine speaks for somebody elsewhere
     "x-forwarded-proto",
     "x-real-ip",
 )
+
+
+class CrossOrigin(ServiceError):
+    """The request comes from another site's page."""
+
+    status_code = 403
 
 
 def install(app: FastAPI, services: Services, routers: Iterable[APIRouter]) -> None:

@@ -13,21 +13,15 @@ from service import collections, pool, projects, streams
 from service.api.access import CallerDep, by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
 from service.api.description import refuses
-from service.errors import (
-    BlobsUnavailable,
-    ForeignFile,
-    InvalidField,
-    InvalidTrajectory,
-    NoProvenance,
-    NoSimulator,
-    SplitConflict,
-    UnknownBehavior,
-)
+from service.errors import InvalidField, NoSimulator, UnknownBehavior
+from service.pool import NoProvenance, SplitConflict
 from service.store import codec, npz
+from service.store.errors import BlobsUnavailable, ForeignFile
 from service.store.queries import labels as label_queries
 from service.store.queries import pool as pool_queries
 from service.store.queries.listing import page
 from service.store.tables import MembershipRow
+from service.streams import InvalidTrajectory
 
 router = APIRouter(tags=["trajectories"])
 reader, labeler = requires("read", by_query), requires("label", by_query)

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, MemoryStore, S3Store, from_url
 
-from service.errors import BlobsUnavailable, CorruptBlob, MissingBlob
 from service.log import get_logger
+from service.store.errors import BlobsUnavailable, CorruptBlob, MissingBlob
 
 if TYPE_CHECKING:
     from obstore.store import RetryConfig

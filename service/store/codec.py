@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from service.errors import ForeignFile
+from service.store.errors import ForeignFile
 
 FORMAT = "asim-trajectory"
 VERSION = 1

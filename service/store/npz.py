@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import ForeignFile
+from service.store.errors import ForeignFile
 
 npy: Any = np.lib.format  # it has no types
 METADATA = "__metadata__"

@@ -91,7 +91,7 @@ def test_training_and_scoring_have_no_way_to_provenance() -> None:
 
 TRY = """
 import sys
-from service.errors import MissingBlob
+from service.store.errors import MissingBlob
 from service.settings import Settings
 from service.store.provenance import ProvenanceBlobs, open_provenance
 settings, sha256 = Settings(), sys.argv[1]

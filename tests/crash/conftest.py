@@ -102,5 +102,5 @@ def deploy(postgres: PrivatePostgres, prepared: Prepared, redis: PrivateRedis, t
 def chance(figures: Figures) -> random.Random:
     """Random moments. ASIM_TEST_SEED repeats those of another run."""
     seed = int(os.environ.get("ASIM_TEST_SEED") or random.SystemRandom().randrange(10**6))
-    figures.note(f"ASIM_TEST_SEED={seed} REPEAT={REPEAT}")
+    figures.note(f"ASIM_TEST_SEED={seed}")
     return random.Random(seed)

@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from uuid import UUID
 
+import pytest
+
 from api_schemas.collections import CollectionCreate
 from api_schemas.environments import Environment
 from api_schemas.jobs import Job
@@ -15,11 +17,21 @@ from service.store.tables import JobRow
 from tests.crash.deployment import children_of
 from tests.loop.processes import Serving, command_of, environment, eventually
 from tests.loop.rows import check_rows, snapshot
+from workers.simulators.base import SimulatorUnavailable
+from workers.simulators.catalog import make_simulator
 
 PATIENT = {"ASIM_JOB_LEASE_SECONDS": "4", "ASIM_JOB_MAX_ATTEMPTS": "50"}
 LEASE_SECONDS = 10.0  # of a batch: what a dead labeler held is free again then
 TASK = Environment(simulator="maniskill", options={"task": "PullCube", "cameras": False, "horizon": 15})
 WORK_SECONDS = 300.0
+
+
+def need_simulator() -> None:
+    """Skips the test, saying why, where ManiSkill is missing."""
+    try:
+        make_simulator("maniskill", dict(TASK.options)).close()
+    except SimulatorUnavailable as error:
+        pytest.skip(str(error))
 
 
 class Robots:

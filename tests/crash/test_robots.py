@@ -12,12 +12,10 @@ from uuid import UUID
 import pytest
 
 from tests.crash.deployment import kill
-from tests.crash.robots import LEASE_SECONDS, TASK, WORK_SECONDS, Robots, simulators_of
+from tests.crash.robots import LEASE_SECONDS, WORK_SECONDS, Robots, need_simulator, simulators_of
 from tests.figures import Figures
 from tests.loop.invariants import check_invariants, retries
 from tests.loop.processes import command_of, eventually
-from workers.simulators.base import SimulatorUnavailable
-from workers.simulators.catalog import make_simulator
 
 pytestmark = [pytest.mark.robots, pytest.mark.timeout(3600)]
 KILLS = int(os.environ.get("REPEAT", "10"))
@@ -29,21 +27,10 @@ COUNT = 60  # segments of a labeler's batch
 @pytest.fixture
 def robots(tmp_path: Path) -> Iterator[Robots]:
     """A service; skips where ManiSkill is missing."""
-    try:
-        make_simulator("maniskill", dict(TASK.options)).close()
-    except SimulatorUnavailable as error:
-        pytest.skip(str(error))
+    need_simulator()
     found = Robots(tmp_path)
     yield found
     found.close()
-
-
-@pytest.fixture
-def chance(figures: Figures) -> random.Random:
-    """Random moments. ASIM_TEST_SEED repeats those of another run."""
-    seed = int(os.environ.get("ASIM_TEST_SEED") or random.SystemRandom().randrange(10**6))
-    figures.note(f"ASIM_TEST_SEED={seed} REPEAT={KILLS}")
-    return random.Random(seed)
 
 
 def test_a_collection_killed_again_and_again_ends_as_one_that_was_not(

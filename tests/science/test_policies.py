@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from models import checkpoints
-from models.networks.image_encoder import SHIFT, shifted
+from models.policies.camera_encoder import SHIFT, shifted
 from models.policies.diffusion import DiffusionPolicy, DiffusionPolicyConfig, training_config
 from models.segments import Observations, SegmentBatch
 from models.spaces import BoxAction, DiscreteAction, Spaces, StreamSpec

@@ -10,8 +10,7 @@ from limits import RateLimitItemPerSecond
 from starlette.types import Message
 
 from service import keys
-from service.api.attempts import FailedKeys
-from service.errors import TooManyFailedKeys
+from service.api.attempts import FailedKeys, TooManyFailedKeys
 from tests.service.access_table import DOCUMENT, ELSEWHERE, Things, ask, endpoints, fill, holder, stranger, table
 from tests.service.conftest import Serve
 from tests.service.kit import UNKNOWN, Served, refused

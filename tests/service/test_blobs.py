@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import CorruptBlob, MissingBlob
 from service.store.blobs import Blobs
+from service.store.errors import CorruptBlob, MissingBlob
 from tests.service.kit import Served, refused, room
 
 

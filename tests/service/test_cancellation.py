@@ -7,7 +7,7 @@ from httpx2 import Response
 from sqlalchemy import select
 
 from service import jobs, rounds, scorings
-from service.errors import JobLost
+from service.jobs import JobLost
 from service.store.tables import JobRow, ProjectRow, RoundRow, ScoringRow
 from tests.service.kit import Served, answers, refused, room
 from tests.service.test_jobs import LEASE, enqueue, generator, kinds, round_asked_for

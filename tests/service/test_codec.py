@@ -13,8 +13,8 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from service.errors import ForeignFile
 from service.store import codec, npz
+from service.store.errors import ForeignFile
 from tests.service.kit import npz as npz_file
 from tests.service.kit import room, same
 

@@ -5,9 +5,9 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.errors import MissingBlob
 from service.garbage import Collected, collect
 from service.store.blobs import Blobs
+from service.store.errors import MissingBlob
 from tests.service.conftest import Serve
 from tests.service.kit import Served, room
 

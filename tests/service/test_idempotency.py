@@ -10,8 +10,8 @@ from uuid import uuid4
 import pytest
 from httpx2 import Response
 
-from service.errors import BlobsUnavailable
 from service.store.blobs import Blobs
+from service.store.errors import BlobsUnavailable
 from tests.service.conftest import Serve
 from tests.service.kit import Json, Served, answers, npz, refused, room
 from tests.service.test_security import key

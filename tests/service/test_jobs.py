@@ -9,7 +9,8 @@ from sqlalchemy.orm import Session
 
 from api_schemas.jobs import JobPayload, ScoreShard, TrainRound, TrainSubgoalGenerator
 from service import jobs, reaper, scorings
-from service.errors import JobLost, UnknownResource
+from service.errors import UnknownResource
+from service.jobs import JobLost
 from service.store.tables import JobRow, ProjectRow, ScoringRow
 from tests.service.conftest import Serve
 from tests.service.kit import Served, answers, room

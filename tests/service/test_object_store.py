@@ -9,8 +9,8 @@ from uuid import uuid4
 
 import pytest
 
-from service.errors import BlobsUnavailable, CorruptBlob, MissingBlob
 from service.store.blobs import Blobs
+from service.store.errors import BlobsUnavailable, CorruptBlob, MissingBlob
 from service.store.provenance import ProvenanceBlobs
 from tests.object_store import BUCKET, ObjectStore, object_store
 from tests.service.conftest import Serve

@@ -10,7 +10,7 @@ from structlog.testing import capture_logs
 
 from api_schemas.jobs import TrainRound
 from service import jobs
-from service.errors import JobLost
+from service.jobs import JobLost
 from tests.service.kit import Served
 from tests.service.test_canaries import plant
 from tests.service.test_jobs import LEASE, claimed, enqueue, generator, reap

@@ -7,7 +7,7 @@ import pytest
 
 from models import checkpoints
 from models.families import GRID
-from service.errors import MissingBlob
+from service.store.errors import MissingBlob
 from service.store.queries import labels as label_queries
 from service.store.tables import ScoringRow
 from tests.workers.in_process import Loop

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import replace
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,11 @@ from asim.client import Client
 from asim.errors import AsimError, Conflict, Invalid, NotFound
 from asim.policy_parts import parts_of
 from models import checkpoints
-from models.policies.diffusion import training_config
-from models.spaces import Spaces
-from models.training import TrainingConfig, advance
+from models.training import advance
+from service.clock import utc_now
+from service.garbage import collect
 from service.store.provenance import ProvenanceBlobs
+from tests.workers.brief_policies import brief
 from tests.workers.conftest import OpenLoop
 from tests.workers.in_process import Loop
 from tests.workers.test_robot_collection import project_of
@@ -38,10 +39,7 @@ STAGES, STEPS = 3, 100
 
 @pytest.fixture(autouse=True)
 def _short_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    def short(spaces: Spaces) -> TrainingConfig:
-        return replace(training_config(spaces), steps=STEPS, batch_size=8)
-
-    monkeypatch.setattr(policy_training, "training_config", short)
+    monkeypatch.setattr(policy_training, "training_config", brief(STEPS))
     monkeypatch.setattr(policy_training, "TRIALS", 1)
 
 
@@ -105,11 +103,11 @@ def test_a_second_attempt_goes_on_from_the_last_stage_to_the_same_weights(
     assert trained(other).result == loop.client.job(job.id).result
 
 
-def stopping_after(stage: int, keep: Callable[..., None]) -> Callable[..., None]:
+def stopping_after(stage: int, keep: Callable[..., None], error: Exception | None = None) -> Callable[..., None]:
     def stopping(*arguments: Any) -> None:
         keep(*arguments)
         if arguments[5] == stage:
-            raise GaveWay("the worker stops")
+            raise error or GaveWay("the worker stops")
 
     return stopping
 
@@ -134,6 +132,30 @@ def test_a_lost_state_means_to_begin_anew_with_the_same_weights(loop: Loop, monk
     assert loop.client.job(job.id).state == "done"
     assert {policy.id for policy in first} <= {policy.id for policy in policies(loop)}
     assert {blob.kind for blob in store(loop).stored()} == {"policies"}
+
+
+@pytest.mark.parametrize("ended", ["cancelled", "failed"])
+def test_a_training_that_ends_early_leaves_its_stages_and_no_state(
+    loop: Loop, monkeypatch: pytest.MonkeyPatch, ended: str
+) -> None:
+    job = loop.client.train_policy(asked(loop))
+    error = ValueError("it cannot go on") if ended == "failed" else None
+    monkeypatch.setattr(policy_training, "_keep", stopping_after(1, policy_training._keep, error))
+    run_next(loop.worker)
+    if ended == "cancelled":
+        assert kinds_after_garbage(loop) == {"policies", "trainings"}  # so far another attempt goes on from it
+        loop.cancel(job.id)
+    assert loop.client.job(job.id).state == ended
+    kept = [policy.id for policy in policies(loop)]
+    assert len(kept) == 2
+    assert kinds_after_garbage(loop) == {"policies"}
+    assert all(loop.client.policy_weights(loop.project.id, policy) for policy in kept)
+
+
+def kinds_after_garbage(loop: Loop) -> set[str]:
+    """What the provenance store holds once all that is old enough and of no use is in the trash."""
+    collect(loop.worker.database, [store(loop)], utc_now() + timedelta(days=2), timedelta(days=1))
+    return {blob.kind for blob in store(loop).stored()}
 
 
 def test_a_collection_rolls_a_policy_out_and_its_labels_are_the_actions_taken(

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from asim.runners import COLLECTOR_QUEUES, SCIENCE_QUEUES, runner_environment
-from service.errors import NoProvenance
+from service.pool import NoProvenance
 from service.settings import Settings
 from service.store.provenance import ProvenanceBlobs, open_provenance
 from tests.workers.conftest import OpenLoop

@@ -1,18 +1,17 @@
 """The ManiSkill simulator: PullCube, PokeCube and LiftPegUpright with a Panda arm, behind the simulator protocol."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.simulators import maniskill_experts, robot_observation
+from workers.simulators import maniskill_experts, robot_behaviors, robot_observation
 from workers.simulators.base import (
     Action,
     Behavior,
     Observation,
-    OptionError,
     Simulator,
     SimulatorError,
     State,
@@ -20,15 +19,14 @@ from workers.simulators.base import (
     Step,
 )
 from workers.simulators.maniskill_env import TASKS, make_env
-from workers.simulators.robot_behaviors import NoisyBehavior, RandomBehavior
 from workers.simulators.robot_observation import ACTION_SPACE, checked_action
 from workers.simulators.robot_options import RobotOptions
 from workers.simulators.robot_progress import Progress
 from workers.simulators.search_settings import SearchSettings
-from workers.simulators.waypoints import ExpertBehavior
 
 SEARCH = SearchSettings(continuous=7, grips=(0.0,))
 NAME = "maniskill"
+BEHAVIORS = robot_behaviors.BEHAVIORS
 HORIZONS = {name: task.horizon for name, task in TASKS.items()}
 
 
@@ -126,17 +124,7 @@ def make_simulator(options: Mapping[str, object]) -> Simulator:
     return ManiSkillSimulator(RobotOptions.parse(NAME, HORIZONS, options))
 
 
-_FACTORIES: dict[str, Callable[[], Behavior]] = {
-    "expert": lambda: ExpertBehavior(maniskill_experts.plan),
-    "noisy_expert": lambda: NoisyBehavior(ExpertBehavior(maniskill_experts.plan)),
-    "random": RandomBehavior,
-}
-BEHAVIORS = tuple(_FACTORIES)
-
-
 def make_behavior(name: str, simulator: Simulator) -> Behavior:
     """The named behavior. Raises OptionError for an unknown name."""
     del simulator
-    if name not in _FACTORIES:
-        raise OptionError(f"Simulator {NAME!r} has no behavior {name!r}; its behaviors are {', '.join(BEHAVIORS)}.")
-    return _FACTORIES[name]()
+    return robot_behaviors.make_behavior(name, NAME, maniskill_experts.plan)

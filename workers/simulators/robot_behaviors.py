@@ -1,10 +1,13 @@
 """Behaviors that fit every robot arm."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.simulators.base import Behavior, Simulator
+from workers.simulators.base import Behavior, OptionError, Simulator
 from workers.simulators.robot_observation import ACTION_SPACE
+from workers.simulators.waypoints import ExpertBehavior, Planner
 
 
 class RandomBehavior:
@@ -38,3 +41,21 @@ class NoisyBehavior:
         action = np.array(self._behavior.act(simulator, rng), np.float32)
         action[:-1] += self._deviation * rng.standard_normal(len(action) - 1)
         return np.clip(action, ACTION_SPACE.low, ACTION_SPACE.high)
+
+
+_FACTORIES: dict[str, Callable[[Planner], Behavior]] = {
+    "expert": ExpertBehavior,
+    "noisy_expert": lambda plan: NoisyBehavior(ExpertBehavior(plan)),
+    "random": lambda plan: RandomBehavior(),
+}
+BEHAVIORS = tuple(_FACTORIES)
+
+
+def make_behavior(name: str, simulator: str, plan: Planner) -> Behavior:
+    """The named behavior for a simulator of that name, whose experts go by `plan`. Raises OptionError for an unknown
+    name."""
+    if name not in _FACTORIES:
+        raise OptionError(
+            f"Simulator {simulator!r} has no behavior {name!r}; its behaviors are {', '.join(BEHAVIORS)}."
+        )
+    return _FACTORIES[name](plan)

@@ -5,7 +5,7 @@ from datetime import datetime
 from sqlalchemy import ColumnElement, delete, select
 from sqlalchemy.orm import Session
 
-from service.errors import KeyBusy
+from service.store.errors import KeyBusy
 from service.store.queries.inserting import insert
 from service.store.tables import IdempotencyRow
 

@@ -1,4 +1,4 @@
-"""A small convolutional encoder of camera images, and the shifts that it is trained under."""
+"""A policy's small convolutional encoder of one camera, and the shifts that it is trained under."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -14,7 +14,7 @@ HALVINGS = 4
 SHIFT = 4  # pixels
 
 
-class ImageEncoder(nn.Module):
+class CameraEncoder(nn.Module):
     """Four convolutions of stride 2 and a linear layer: uint8 (B, H, W, C) -> (B, size). H, W: multiples of 16."""
 
     def __init__(self, shape: Sequence[int], channels: int, size: int) -> None:
