@@ -10,8 +10,9 @@ from models.families import Family, family_named
 from models.network import Network
 from models.training import TrainingConfig
 from service import events, projects
-from service.errors import CorruptBlob, MissingBlob, NoModelFamily
+from service.errors import NoModelFamily
 from service.log import get_logger
+from service.store.errors import CorruptBlob, MissingBlob
 from service.store.queries import rounds as queries
 from service.store.tables import ModelVersionRow, ProjectRow, RoundRow
 from workers import data
