@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.open_loop import open_loop_errors
+from models.open_loop import OpenLoopError, open_loop, open_loop_errors
 from models.segments import SegmentBatch
 from tests.science import toy_robot
 
@@ -26,6 +26,23 @@ def test_pixels_count_as_shares_of_white() -> None:
     film = torch.zeros(1, 2, 16, 16, 3, dtype=torch.uint8)
     film[0, 1, :8] = 255
     assert open_loop_errors(model, _batch("camera", film), horizons=(1,))[1]["camera"] == pytest.approx(0.5)
+
+
+def test_what_is_not_foreseen_is_a_share_of_what_changes() -> None:
+    model = toy_robot.Standstill(toy_robot.POINT, toy_robot.TINY, torch.Generator())
+    batch = toy_robot.points(20, 40, seed=0)
+    found = open_loop(model, batch)
+    assert [each.horizon for each in found] == [8, 32, 40]
+    for each in found:
+        assert each.errors["position"] == pytest.approx(each.standing_still["position"], rel=1e-5)
+        assert each.unforeseen == pytest.approx(1.0, rel=1e-5)
+    assert [each.horizon for each in open_loop(model, toy_robot.points(2, 8, seed=0))] == [8]
+
+
+def test_the_share_is_a_mean_over_the_streams_that_change() -> None:
+    error = OpenLoopError(8, {"arm": 1.0, "table": 0.5, "camera": 3.0}, {"arm": 4.0, "table": 0.0, "camera": 4.0})
+    assert error.unforeseen == pytest.approx((0.25 + 0.75) / 2)
+    assert OpenLoopError(8, {"table": 0.5}, {"table": 0.0}).unforeseen is None
 
 
 def test_segments_shorter_than_the_horizon_are_refused() -> None:

@@ -230,3 +230,47 @@ def test_going_back_before_policies_forgets_them_and_their_trainings(url: str) -
     check_references(url)
     migrate(url)
     assert differences(url) == []
+
+
+def test_going_back_before_robots_train_leaves_documents_that_an_older_service_reads(url: str) -> None:
+    migrate(url, "0001")
+    fill(url)
+    migrate(url, "0010")
+    robot = quoted(url, FIRST)
+    actions = {"kind": "box", "shape": [2], "low": -1.0, "high": 1.0}
+    spaces = {"observations": {"arm": {"dtype": "float32", "shape": [3], "high": None}}, "actions": actions}
+    environment = {"simulator": None, "options": {}}
+    documents = [json.dumps(spaces), json.dumps(environment | {"spaces": spaces})]
+    write(url, f"UPDATE project SET spaces = '{documents[0]}', environment = '{documents[1]}' WHERE id = '{robot}'")
+    write(url, f"UPDATE project SET family = NULL WHERE id = '{robot}'")
+    before, schema = read(url), schema_of(url)
+    migrate(url)
+    told = [text.replace('"high": 1.0}', '"high": 1.0, "signs": [1]}') for text in documents]
+    values = f"family = 'robot', preset = 'small', spaces = '{told[0]}', environment = '{told[1]}'"
+    write(
+        url,
+        f"UPDATE project SET {values} WHERE id = '{robot}'",
+        "UPDATE model_version SET parent_id = id",
+        *(
+            f"UPDATE round SET model_error = '{json.dumps(row['model_error'] | {'open_loop': []})}' "
+            f"WHERE id = '{quoted(url, UUID(str(row['id'])))}'"
+            for row in before["round"]
+            if row["model_error"]
+        ),
+        *(
+            f"UPDATE job SET payload = '{json.dumps(row['payload'] | {'memberships': 3})}' "
+            f"WHERE id = '{quoted(url, UUID(str(row['id'])))}'"
+            for row in before["job"]
+            if row["kind"] == "train_round"
+        ),
+    )
+    downgrade(url, "0010")
+    after = read(url)
+    assert (version(url), schema_of(url)) == ("0010", schema)
+    assert {row["status"] for row in after["round"] if UUID(str(row["project_id"])) == FIRST} == {"superseded"}
+    rounds = [row | {"status": "current"} for row in after.pop("round")]
+    assert rounds == before["round"]
+    assert after == {name: rows for name, rows in before.items() if name != "round"}
+    check_references(url)
+    migrate(url)
+    assert differences(url) == []
