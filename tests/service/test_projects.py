@@ -121,8 +121,9 @@ def test_a_users_own_robot_keeps_its_spaces(served: Served) -> None:
             "wrist": {"dtype": "uint8", "shape": [64, 64, 3], "high": None},
             "proprioception": {"dtype": "float32", "shape": [9], "high": None},
         },
-        "actions": {"kind": "box", "shape": [7], "low": -1.0, "high": 1.0},
+        "actions": {"kind": "box", "shape": [7], "low": -1.0, "high": 1.0, "signs": []},
     }
+    assert (project["family"], project["preset"]) == ("robot", "small")
     assert (project["segment_length"], project["stride"]) == (4, 6)
     answer = served.client.post("/collections", json={"project": project["id"], "transitions": 5})
     refused(answer, 409, "no-simulator", project["id"])

@@ -42,7 +42,7 @@ def queued(loop: Loop) -> list[tuple[Proposal, float | None]]:
 @pytest.fixture
 def few_states(monkeypatch: pytest.MonkeyPatch) -> None:
     """A job looks at 100 states of the 600, for tests that do not ask which."""
-    monkeypatch.setattr("workers.exploration.STATES", 100)
+    monkeypatch.setattr("models.exploration.STATES", 100)
 
 
 @pytest.mark.usefixtures("few_states")
@@ -188,7 +188,7 @@ def test_a_cancelled_job_is_asked_for_anew(trained: Loop) -> None:
 def test_after_a_cancelled_job_other_states_are_drawn_than_before(
     opened: OpenLoop, trained_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workers.exploration.STATES", 20)
+    monkeypatch.setattr("models.exploration.STATES", 20)
     trained = opened(trained_folder, queue_length=10)
     first = trained.acquire(10, mode="explore")
     with pytest.raises(NotReady):
@@ -222,7 +222,7 @@ def test_what_was_given_out_is_not_proposed_again_and_in_the_end_there_is_nothin
 def test_nor_is_it_from_another_state_that_looks_the_same(
     opened: OpenLoop, trained_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workers.exploration.STATES", 400)  # of 600: others of a room are drawn the second time
+    monkeypatch.setattr("models.exploration.STATES", 400)  # of 600: others of a room are drawn the second time
     trained = opened(trained_folder)
     given = [item for _ in range(4) for item in trained.acquire(150, mode="explore").items]
     assert len(trained.jobs("propose_explorations")) == 2
