@@ -1,6 +1,7 @@
 """Recorded trajectories, with or without their actions, from npz files.
 
-A request is taken whole or not at all. Two are on their way at once: the service reads one while it stores the other.
+A request is taken whole or not at all. Three are on their way at once: the service receives one while it stores the
+others.
 """
 
 import zipfile
@@ -25,7 +26,7 @@ from asim.errors import AsimError, Conflict, Invalid
 
 UPLOAD_FILES, UPLOAD_BYTES = 200, 32 * 2**20  # of one request, so that no upload meets the service's limit
 BATCH_FILES, BATCH_BYTES = 200, 24 * 2**20  # of one with actions: in base64 well below the service's limit
-AHEAD = 2  # requests on their way at once
+AHEAD = 3  # requests on their way at once
 ACTIONS = "actions.npy"  # the member of an npz file that holds an array named actions
 Answer = TypeVar("Answer")
 

@@ -9,6 +9,7 @@ import structlog
 from fastapi import FastAPI
 
 from service import traces
+from service.allocator import keep_freed_memory
 from service.api import (
     acquisitions,
     description,
@@ -87,6 +88,7 @@ def open_services(settings: Settings, clock: Callable[[], datetime] = utc_now) -
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     held: Services = app.state.services
     freeze_imports()
+    keep_freed_memory()
     relay = (
         None if held.settings.embedded or not held.settings.relay else Relay(held.database, held.settings, held.clock)
     )

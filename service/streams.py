@@ -1,7 +1,7 @@
 """Observations that come in: npz files held against a project's spaces, before and after they are unpacked."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, BinaryIO, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ class Shaped(Protocol):
         """Of every number."""
 
 
-def read(spaces: Spaces, files: Sequence[tuple[str, BinaryIO]], max_bytes: int) -> list[Arrays]:
+def read(spaces: Spaces, files: Sequence[tuple[str, bytes | memoryview]], max_bytes: int) -> list[Arrays]:
     """The arrays of each file; what does not fit the spaces, or is too large, is refused before it is unpacked.
 
     files: with the name to call each by. max_bytes: that all together may unpack to.
@@ -39,8 +39,8 @@ def read(spaces: Spaces, files: Sequence[tuple[str, BinaryIO]], max_bytes: int) 
     All of them are checked: who refuses one has stored none. Raises ForeignFile, InvalidTrajectory.
     """
     opened, total = [], 0
-    for source, file in files:
-        opened.append(NpzFile(file, source, max_bytes))
+    for source, content in files:
+        opened.append(NpzFile(content, source, max_bytes))
         total += opened[-1].bytes
         if total > max_bytes:
             raise ForeignFile(source, f"and the files before it unpack to {total} bytes, {max_bytes} are allowed")

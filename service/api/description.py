@@ -109,7 +109,8 @@ def _fields(operation: Json, schemas: Json) -> list[str]:
     """Of the body."""
     found: list[str] = []
     for content in operation.get("requestBody", {}).get("content", {}).values():
-        found += schemas[content["schema"]["$ref"].rpartition("/")[2]].get("properties", {})
+        told = content["schema"]
+        found += schemas.get(told.get("$ref", "").rpartition("/")[2], told).get("properties", {})
     return found
 
 

@@ -1,6 +1,5 @@
 """/labels."""
 
-import io
 from datetime import datetime
 from uuid import UUID
 
@@ -108,9 +107,7 @@ def _store_trajectories(held: Services, request: LabelsRequest) -> list[LabeledU
     names = [f"trajectories[{position}]" for position in range(len(request.trajectories))]
     for name, trajectory in zip(names, request.trajectories, strict=True):
         check_actions(spaces, trajectory.actions, trajectory.action_sets, name)
-    files = [
-        (f"{name}.content", io.BytesIO(one.content)) for name, one in zip(names, request.trajectories, strict=True)
-    ]
+    files = [(f"{name}.content", one.content) for name, one in zip(names, request.trajectories, strict=True)]
     arrays = streams.read(spaces, files, held.settings.max_body_bytes)
     return [
         LabeledUpload(

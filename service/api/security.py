@@ -21,7 +21,6 @@ from service.api import problems
 from service.api.access import NO_KEY, ON_THIS_MACHINE, AccessTable, Caller
 from service.api.attempts import FailedKeys
 from service.api.dependencies import Services
-from service.api.gathering import gathered
 from service.api.headers import CORRELATION, HEADERS
 from service.api.problems import BodyTooLarge
 from service.errors import ServiceError
@@ -109,8 +108,7 @@ class Guard:
         except problems.OUTAGES as error:
             await problems.outage(request, error)(request.scope, receive, send)
         else:
-            bounded = _bounded(receive, limit, counted=counted)
-            await self._app(request.scope, bounded if counted else gathered(bounded), send)
+            await self._app(request.scope, _bounded(receive, limit, counted=counted), send)
 
     async def _admit(self, request: Request) -> None:
         """Say who asks, for handlers, events and logs. Raises Unauthenticated, TooManyFailedKeys."""

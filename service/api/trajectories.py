@@ -3,7 +3,7 @@
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, File, Query, Response, UploadFile
+from fastapi import APIRouter, Depends, Query, Response
 
 from api_schemas.base import Page
 from api_schemas.collections import CollectionCreate
@@ -13,6 +13,7 @@ from service import collections, pool, projects, streams
 from service.api.access import CallerDep, by_body, by_query, requires
 from service.api.dependencies import Cursor, Now, PageSize, ReadSession, ServicesDep, WriteSession
 from service.api.description import refuses
+from service.api.uploads import DESCRIBED, Upload, uploads
 from service.errors import InvalidField, NoSimulator, UnknownBehavior
 from service.pool import NoProvenance, SplitConflict
 from service.store import codec, npz
@@ -27,7 +28,7 @@ router = APIRouter(tags=["trajectories"])
 reader, labeler = requires("read", by_query), requires("label", by_query)
 Start = Annotated[int, Query(ge=0, description="first observation")]
 Length = Annotated[int | None, Query(ge=0, description="transitions after it; default to the end")]
-Files = Annotated[list[UploadFile], File(min_length=1, max_length=1000, description="npz files, one a trajectory")]
+Files = Annotated[list[Upload], Depends(uploads)]
 NPZ = "application/octet-stream"
 NPZ_FILE: dict[int | str, dict[str, Any]] = {
     200: {"description": "An npz file, one array a stream, time first", "content": {NPZ: {}}}
@@ -39,6 +40,7 @@ NPZ_FILE: dict[int | str, dict[str, Any]] = {
     status_code=201,
     responses=refuses(ForeignFile, InvalidTrajectory, SplitConflict, BlobsUnavailable),
     dependencies=[labeler],
+    openapi_extra=DESCRIBED,
 )
 def add_trajectories(
     project: UUID, files: Files, held: ServicesDep, now: Now, split: SplitChoice = "auto"
@@ -46,9 +48,8 @@ def add_trajectories(
     with held.database.read() as session:
         spaces = projects.spaces_of(projects.find(session, project))
     # Blobs first: they are named by content, so a crash before the rows leaves nothing wrong behind.
-    named = [(file.filename or "file", file.file) for file in files]
-    arrays = streams.read(spaces, named, held.settings.max_body_bytes)
-    stored = [pool.write(held.blobs, spaces, each, name) for (name, _), each in zip(named, arrays, strict=True)]
+    arrays = streams.read(spaces, files, held.settings.max_body_bytes)
+    stored = [pool.write(held.blobs, spaces, each, file.name) for file, each in zip(files, arrays, strict=True)]
     with held.database.write() as session:
         pool.keep(session, stored, now)
         row = projects.find(session, project, lock=True)

@@ -62,7 +62,7 @@ def decode(data: bytes, source: str, start: int = 0, stop: int | None = None) ->
 def _compressed(name: str, array: NDArray[Any]) -> Arrays:
     compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
     chunks = [array[i : i + CHUNK_STEPS] for i in range(0, len(array), CHUNK_STEPS)]
-    frames = [compressor.compress(np.ascontiguousarray(chunk).tobytes()) for chunk in chunks]
+    frames = [compressor.compress(np.ascontiguousarray(chunk).data) for chunk in chunks]
     return {f"{name}/{i}": np.frombuffer(frame, np.uint8) for i, frame in enumerate(frames)}
 
 

@@ -2,14 +2,13 @@
 
 import io
 import math
-import mmap
 import struct
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,6 @@ LONGEST_DIRECTORY = 2**16 + 22  # bytes: what zipfile looks for its end in; an e
 LONGEST_HEADER = 1_000  # bytes; one of eight axes takes 200, and numpy takes 9 ms for a hostile one of 10,000
 HEADERS = {(1, 0): (2, npy.read_array_header_1_0), (2, 0): (4, npy.read_array_header_2_0)}  # width of the length
 BLOCK = 2**20
-LONG = 2**20  # bytes: from here on a file of an upload is on the disk
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy writes; zipfile bounds the output of no other
 
 
@@ -40,7 +38,7 @@ def dump(arrays: Mapping[str, NDArray[Any]], metadata: str | None = None) -> byt
 
 def parse(data: bytes, source: str, max_bytes: int) -> dict[str, NDArray[Any]]:
     """Npz bytes to arrays, read-only. Raises ForeignFile for anything that is not a whole npz of plain arrays."""
-    return NpzFile(io.BytesIO(data), source, max_bytes).arrays()
+    return NpzFile(data, source, max_bytes).arrays()
 
 
 @dataclass(frozen=True)
@@ -60,10 +58,10 @@ class NpzFile:
     forms: by stream. bytes: that the arrays take unpacked.
     """
 
-    def __init__(self, file: BinaryIO, source: str, max_bytes: int) -> None:
+    def __init__(self, content: bytes | memoryview, source: str, max_bytes: int) -> None:
         """Raises ForeignFile for what is no npz of plain arrays, or would unpack to more than `max_bytes`."""
-        self._file, self.source = file, source
-        with self._reading(), _opened(file) as archive:
+        self._content, self.source = memoryview(content), source
+        with self._reading(), _opened(self._content) as archive:
             members = archive.infolist()
             self.bytes = sum(info.file_size for info in members)
             if self.bytes > max_bytes:
@@ -75,9 +73,8 @@ class NpzFile:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All streams, read-only. Raises ForeignFile."""
-        with self._reading(), _opened(self._file) as archive:
-            held = _held(self._file)
-            return {name: _array(archive, held, form) for name, form in self.forms.items()}
+        with self._reading(), _opened(self._content) as archive:
+            return {name: _array(archive, self._content, form) for name, form in self.forms.items()}
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -90,24 +87,41 @@ class NpzFile:
 
 
 class _Opening:
-    """A file of which no more than LONGEST_DIRECTORY is read at once until it `is_open`: zipfile reads the directory of
-    an archive whole, however long it says that it is, and makes an object of each entry."""
+    """Bytes as a file, of which no more than LONGEST_DIRECTORY is read at once until it `is_open`: zipfile reads the
+    directory of an archive whole, however long it says that it is, and makes an object of each entry."""
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self.is_open = file, False
-        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+    def __init__(self, content: memoryview) -> None:
+        self._content, self._at, self.is_open = content, 0, False
 
     def read(self, size: int = -1) -> bytes:
         """Raises ValueError."""
         if not self.is_open and size > LONGEST_DIRECTORY:
             raise ValueError(f"a directory of {size} bytes, {LONGEST_DIRECTORY} are allowed")
-        return self._file.read(size)
+        piece = bytes(self._content[self._at : None if size < 0 else self._at + size])
+        self._at += len(piece)
+        return piece
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Raises OSError."""
+        at = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: len(self._content)}[whence] + offset
+        if at < 0:
+            raise OSError(f"a place {-at} bytes before the first")
+        self._at = at
+        return at
+
+    def tell(self) -> int:
+        """Where the next byte is read."""
+        return self._at
+
+    def seekable(self) -> bool:
+        """It is."""
+        return True
 
 
 @contextmanager
-def _opened(file: BinaryIO) -> Iterator[zipfile.ZipFile]:
+def _opened(content: memoryview) -> Iterator[zipfile.ZipFile]:
     """The archive of few enough members. Raises ValueError."""
-    opening = _Opening(file)
+    opening = _Opening(content)
     with zipfile.ZipFile(opening) as archive:
         opening.is_open = True
         members = len(archive.infolist())
@@ -135,15 +149,6 @@ def _form(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Form:
     if dtype.hasobject or promised != held:
         raise ValueError(f"{info.filename} promises {promised} bytes of {dtype} and holds {held}")
     return Form(info, shape, dtype, fortran, offset)
-
-
-def _held(file: BinaryIO) -> memoryview:
-    """The file's bytes where they are: fresh memory for a copy of a long one costs more than all of its checks."""
-    if isinstance(file, io.BytesIO):
-        return file.getbuffer()
-    size = file.seek(0, io.SEEK_END)
-    file.seek(0)
-    return memoryview(file.read() if size < LONG else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
 
 def _array(archive: zipfile.ZipFile, held: memoryview, form: Form) -> NDArray[Any]:

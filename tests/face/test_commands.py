@@ -97,7 +97,7 @@ def test_an_import_names_the_file_that_is_refused_and_says_what_is_in(
     assert said.count("\n") == 1
     told = re.search(r"(\d+) of 20 files are in", said)
     assert told is not None
-    assert 7 <= int(told[1]) <= 10  # a request that was on its way already is answered
+    assert 7 <= int(told[1]) <= 13  # two requests that were on their way already are answered
     assert json.loads(asim("project", "show", own))["counts"]["pool_trajectories"] == int(told[1])
     recording(files[7], 7, labeled=labeled)
     asim("import", own, *map(str, files), "--split", "pool")
