@@ -239,7 +239,7 @@ def test_going_back_before_robots_train_leaves_documents_that_an_older_service_r
     robot = quoted(url, FIRST)
     actions = {"kind": "box", "shape": [2], "low": -1.0, "high": 1.0}
     spaces = {"observations": {"arm": {"dtype": "float32", "shape": [3], "high": None}}, "actions": actions}
-    environment = {"simulator": None, "options": {}}
+    environment: dict[str, object] = {"simulator": None, "options": {}}
     documents = [json.dumps(spaces), json.dumps(environment | {"spaces": spaces})]
     write(url, f"UPDATE project SET spaces = '{documents[0]}', environment = '{documents[1]}' WHERE id = '{robot}'")
     write(url, f"UPDATE project SET family = NULL WHERE id = '{robot}'")
