@@ -96,7 +96,7 @@ class LatentSubgoalGenerator(nn.Module):
         place, start = _uniform(change[..., :1], generator), _normal(change, generator)
         remembered = (_uniform(change[:, 1:, :1], generator) >= self.config.forget).float()
         before = torch.cat((torch.zeros_like(change[:, :1]), change[:, :-1] * remembered), 1)
-        remembered = torch.cat((torch.zeros_like(remembered[:, :1]), remembered), 1)
+        remembered = torch.cat((torch.zeros_like(place[:, :1]), remembered), 1)
         flow = self._velocity(torch.lerp(start, change, place), place, known[:, :-1], before, remembered)
         return (flow - (change - start)).square().mean() + self.frame.error(blurred, batch.observations)
 

@@ -103,3 +103,12 @@ def test_chains_of_pictures_show_one_square_that_moves_a_little() -> None:
     overlap = (chain[:, 1:].float() * chain[:, :1].float()).mean(-1).sum((2, 3)) / 255.0**2
     assert float(overlap[:, 0].mean()) > 7.0  # of 16: mostly where it was; a square anywhere would have 1.6
     assert float(overlap[:, 0].mean()) > float(overlap[:, 2].mean()) + 1.0  # it goes away from there
+
+
+def test_it_learns_from_segments_of_a_single_step() -> None:
+    generator = torch.Generator().manual_seed(0)
+    model = LatentSubgoalGenerator(toy_robot.POINT, SMALL, generator)
+    batch = toy_robot.points(50, 1, seed=1).without_labels()
+    train(model, batch, TrainingConfig(3, 16, 1e-3, 0.0), generator)
+    chain = model.sample(at(batch.observations, 0), 2, generator)
+    assert chain["position"].shape == (50, 3, 2)

@@ -23,7 +23,9 @@ from models.world_models.recurrent import RecurrentWorldModel
 from tests.science import toy_robot
 from tests.workers.conftest import OpenLoop, new_project
 from tests.workers.in_process import Loop
+from tests.workers.test_robot_collection import project_of
 from workers import data, trainer
+from workers.labeling import run_labeling
 from workers.training import BASE
 from workers.training_processes import TrainingProcesses
 
@@ -266,3 +268,19 @@ def test_strategies_that_try_every_action_are_refused_at_every_door(points: Loop
     environment = Environment.model_validate({"spaces": SPACES})
     with pytest.raises(ServiceError, match=r"policy\.strategy.*tries every action"):
         new_project(points, name="other", environment=environment, policy=LabelingPolicy(strategy=strategy))
+
+
+def test_explore_mode_has_a_robot_executed_along_the_worst_chains(opened: OpenLoop) -> None:
+    loop = project_of(opened, "maniskill", cameras=False)
+    loop.collect(trajectories=4, seed=1, split="pool")
+    loop.label(12, "random")
+    done = loop.train()
+    assert (done.status, done.error) == ("current", None)
+    batch = loop.acquire(4, "cycle", mode="explore")
+    assert (batch.round, batch.strategy, len(batch.items)) == (done.id, "cycle", 4)
+    for item in batch.items:
+        assert np.shape(item.actions) == (1, 7)
+        assert bool((np.abs(np.array(item.actions)) <= 1).all())
+    before = loop.project.counts.labeled
+    run_labeling(loop.client, batch, np.random.default_rng(0))
+    assert loop.project.counts.labeled == before + 4
