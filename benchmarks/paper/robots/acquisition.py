@@ -64,7 +64,7 @@ class ArmRun:
             trained = time.process_time()
             rounds.append(self._told(found, data) | {"training_and_scoring": trained - began})
             began = time.process_time()
-            if found.number > self.profile.batches:
+            if found.scores is None:
                 self._keep_rollouts(found, data)
         experiment.finish()
         about = {"task": self.task.name, "arm": self.arm.name, "warm": self.warm, "seed": self.seed}
@@ -80,16 +80,22 @@ class ArmRun:
         world_model = found.models.world_model
         assert world_model is not None
         tests = data.tests.to(self.device)
-        rows = ranked_rows(data.pool, self.seed)
-        losses = true_losses(world_model, data.pool.take(rows).to(self.device))
         return {
             "labels": found.labeled.size,
             "transitions": found.labeled.size * found.labeled.length,
             "errors": open_loop(world_model, tests, self.profile.horizons),
-            "ranks": ranks(found.scores[rows], losses) if self.arm.arm.scores.needs else {},
+            "ranks": self._ranks(found, data),
             "inverse": inverse_error(found.models, tests),
             "picks": self._picks(found, data),
         }
+
+    def _ranks(self, found: Round, data: Data) -> Json:
+        """None of an arm that looks at nothing, or where nothing is chosen."""
+        world_model = found.models.world_model
+        if found.scores is None or not self.arm.arm.scores.needs or world_model is None:
+            return {}
+        rows = ranked_rows(data.pool, self.seed)
+        return ranks(found.scores[rows], true_losses(world_model, data.pool.take(rows).to(self.device)))
 
     def _picks(self, found: Round, data: Data) -> Json:
         """Which segments, and how many of each source. Of the whole pool only how many."""

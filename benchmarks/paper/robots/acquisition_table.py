@@ -57,13 +57,13 @@ FINAL: dict[str, Measure] = {
     "32 steps": error(32),
     "proprioception, 8": error(8, "proprioception"),
     "proprioception, 32": error(32, "proprioception"),
-    "inverse": lambda told: told["inverse"],
 }
 """After the last round."""
 CHOOSING: dict[str, Measure] = {
     "rank of own loss": rank("own"),
     "rank of pixels": rank("pixels"),
     "rank of proprioception": rank("proprioception"),
+    "inverse": lambda told: told["inverse"],
 }
 """In the rounds that choose: means over them."""
 

@@ -67,8 +67,10 @@ def _shared(runs: Sequence[ArmRun]) -> list[tuple[ArmRun, str]]:
 
 
 def _seconds_of(run: ArmRun, device: str) -> float:
-    """Of the rounds after the first."""
-    return run.profile.batches * sum(_seconds(run.profile, kind, device, first=False) for kind in _kinds(run))
+    """Of the rounds after the first; the last one trains the world model only, none the subgoal generator."""
+    batches = run.profile.batches
+    rounds = {"world_model": batches, "subgoal_generator": 0}
+    return sum(rounds.get(kind, batches - 1) * _seconds(run.profile, kind, device, first=False) for kind in _kinds(run))
 
 
 def _seconds(profile: Profile, kind: str, device: str, first: bool) -> float:

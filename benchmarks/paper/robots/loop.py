@@ -5,7 +5,7 @@ numbers of them would be unequal numbers of labels. Every minibatch is drawn fro
 it is kept for the expert, so that what was chosen is what is learned from.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache
@@ -66,12 +66,15 @@ def load(profile: Profile, task: TaskPlan, folder: Path) -> Data:
 
 @dataclass(frozen=True)
 class Round:
-    """What a round is after its training; scores (N,) of the whole pool, and which rows of it are labeled next."""
+    """What a round is after its training; scores (N,) of the whole pool, and which rows of it are labeled next.
+
+    The last one trains a world model only, which is tested: it scores and picks nothing.
+    """
 
     number: int
     labeled: SegmentBatch
     models: Models
-    scores: Tensor
+    scores: Tensor | None
     picks: Tensor
 
 
@@ -93,21 +96,22 @@ class Experiment:
     device: str = "cpu"
 
     def rounds(self) -> Iterator[Round]:
-        """`batches` + 1 of them; the last one picks nothing."""
+        """`batches` + 1 of them."""
         pool = self.data.pool.to(self.device)
         free = torch.ones(pool.size, dtype=torch.bool)
         labeled, found = self.data.warm_up(self.warm, self.seed), dict[Member, Network]()
         previous = None
-        for number in range(1, self.profile.batches + 2):
-            found = self._trained(number, labeled, found)
+        for number in range(1, self.profile.batches + 1):
+            found = self._trained(number, labeled, found, self._kinds)
             models = replace(_models(found), previous_world_model=previous)
             scores = self._scores(number, models, pool)
-            last = number > self.profile.batches
-            picks = torch.zeros(0, dtype=torch.int64) if last else self._picks(number, models, scores, free, pool)
+            picks = self._picks(number, models, scores, free, pool)
             yield Round(number, labeled, models, scores, picks)
             free[picks] = False
             labeled = concatenate([labeled, self.data.pool.take(picks)]) if len(picks) else labeled
             previous = models.world_model
+        last = self._trained(self.profile.batches + 1, labeled, found, {"world_model"})
+        yield Round(self.profile.batches + 1, labeled, _models(last), None, torch.zeros(0, dtype=torch.int64))
 
     def finish(self) -> None:
         """Deletes the later rounds' networks."""
@@ -119,16 +123,25 @@ class Experiment:
 
     def warmed_up(self) -> Models:
         """What the arm needs, after the warm-up."""
-        return _models(self._trained(1, self.data.warm_up(self.warm, self.seed), {}))
+        return _models(self._trained(1, self.data.warm_up(self.warm, self.seed), {}, self._kinds))
 
-    def _trained(self, number: int, labeled: SegmentBatch, before: dict[Member, Network]) -> dict[Member, Network]:
-        kinds = ({"world_model"} | self._strategy.needs) - {"previous_world_model"}
+    @property
+    def _kinds(self) -> frozenset[str]:
+        return (self._strategy.needs | {"world_model"}) - {"previous_world_model"}
+
+    def _trained(
+        self, number: int, labeled: SegmentBatch, before: dict[Member, Network], kinds: Set[str]
+    ) -> dict[Member, Network]:
         members = [(k, m) for k in sorted(kinds) for m in range(ENSEMBLE_MEMBERS if k == "ensemble" else 1)]
         return {member: self._network(number, member, labeled, before.get(member)) for member in members}
 
     def _network(self, number: int, member: Member, labeled: SegmentBatch, before: Network | None) -> Network:
-        """From the weights of the round before where there are such and its schedule says so."""
+        """From the weights of the round before where there are such and its schedule says so.
+
+        What the subgoal generator learns from no label adds to: it is trained once, for all arms.
+        """
         kind, place = member
+        number, before = (1, None) if kind == "subgoal_generator" else (number, before)
         built = "world_model" if kind == "ensemble" else kind
         folder = self.shared if number == 1 else self.own
         path = folder / f"{kind}-{place}-{number}.safetensors"
