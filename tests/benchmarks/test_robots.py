@@ -3,12 +3,13 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from benchmarks.paper.robots import cost, networks
+from benchmarks.paper.robots import cost, distances, networks
 from benchmarks.paper.robots.__main__ import main, recordings_of, runs_of
 from benchmarks.paper.robots.acquisition_table import jaccard, tell
 from benchmarks.paper.robots.arms import MANY, RobotArm
@@ -17,7 +18,7 @@ from benchmarks.paper.robots.profiles import PROFILES, QUICK, Profile, TaskPlan
 from benchmarks.paper.runs import Json, do, result_file
 from models import checkpoints
 from models.families import ROBOT
-from models.training import TrainingConfig
+from models.training import TrainingConfig, TrainingState, advance
 from tests.science import toy_robot
 from workers.simulators.base import SimulatorUnavailable
 from workers.simulators.catalog import make_simulator
@@ -51,6 +52,19 @@ def test_finished_runs_are_told(out: Path, monkeypatch: pytest.MonkeyPatch, caps
     for line in ("the whole pool labeled", "chosen by the true loss", "in common (Jaccard)", "standing still"):
         assert line in shown
     assert (out / TINY.name / "5-PullCube-4.png").exists()
+
+
+def test_distances_are_compared_on_one_model(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PROFILES, TINY.name, TINY)
+    networks_of = out / TINY.name / "networks"
+    kept = sorted(networks_of.rglob("*.safetensors"))
+    asked = ["--profile", "quick", "--task", "PullCube", "--out", str(out)]
+    figures = {figure.name: figure.value for figure in distances.main(asked)}
+    assert sorted(networks_of.rglob("*.safetensors")) == kept  # those of the benchmark
+    names = {f"{form}_{actions}" for form in ("divergence", "decoded") for actions in ("true", "inferred")}
+    assert {name.rpartition("_")[0] for name in figures} == names
+    assert all(-1.0 <= value <= 1.0 for value in figures.values())
+    assert distances.worst_found(torch.tensor([3.0, 1.0, 2.0]), torch.tensor([3.0, 2.0, 1.0]), 2) == 0.5
 
 
 def test_budgets_bind_and_nothing_is_labeled_twice(out: Path) -> None:
@@ -107,7 +121,7 @@ def test_a_training_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest
     whole = trained(tmp_path / "whole.safetensors")
     monkeypatch.setattr(networks, "SAVED_EVERY", -1.0)
     with monkeypatch.context() as patch:
-        patch.setattr(networks, "advance", _twice(networks.advance))
+        patch.setattr(networks, "advance", Interrupted())
         with pytest.raises(KeyboardInterrupt):
             trained(tmp_path / "stopped.safetensors")
     assert (tmp_path / "stopped.training").exists()
@@ -116,17 +130,18 @@ def test_a_training_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest
     assert checkpoints.describe(whole)["kind"] == "world_model"
 
 
-def _twice(function):  # type: ignore[no-untyped-def]  # whatever it takes
-    """Works twice, then is interrupted."""
-    left = [2]
+class Interrupted:
+    """Trains twice, then is interrupted."""
 
-    def wrapped(*args, **named):  # type: ignore[no-untyped-def]  # the same
-        left[0] -= 1
-        if left[0] < 0:
+    def __init__(self) -> None:
+        self._left = 2
+
+    def __call__(self, *args: Any, **named: Any) -> TrainingState:
+        """As `advance`."""
+        self._left -= 1
+        if self._left < 0:
             raise KeyboardInterrupt
-        return function(*args, **named)
-
-    return wrapped
+        return advance(*args, **named)
 
 
 def test_partial_figures_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -34,8 +34,8 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
     asked = _parser().parse_args(argv)
     profile, out = chosen(asked), asked.out / asked.profile
     runs, recordings = runs_of(profile, out, asked.device), recordings_of(profile)
-    folder = out / "data"
-    missing = [run for run in runs if read(result_file(out, run)) is None]
+    folder, kept = out / "data", out / (asked.distance or "")
+    missing = [run for run in runs if read(result_file(kept, run)) is None]
     unmade = [each for each in recordings if not each.file(folder).exists()]
     torch.set_num_threads(asked.threads)
     if missing:
@@ -43,10 +43,10 @@ def main(argv: Sequence[str] | None = None) -> list[Figure]:
         policies = list(dict.fromkeys(each.policy for each in recordings))
         run_missing([PolicyTraining(each, folder) for each in policies], folder, asked.processes, asked.threads)
         run_missing([RecordingRun(each, folder) for each in recordings], folder, asked.processes, asked.threads)
-        run_missing(missing, out, asked.processes, asked.threads)
-    for path in pictures(runs, out):
+        run_missing(missing, kept, asked.processes, asked.threads)
+    for path in pictures(runs, kept):
         print(path)
-    return tell(results(runs, out), len(runs), out)
+    return tell(results(runs, kept), len(runs), kept, targets=profile.shorter == 1)
 
 
 def chosen(asked: argparse.Namespace) -> Profile:
@@ -81,7 +81,7 @@ def recordings_of(profile: Profile) -> list[Recording]:
 
 
 def pictures(runs: Sequence[ArmRun], out: Path) -> list[Path]:
-    """Of the first seed of every comparison."""
+    """Of the first seed of every comparison; beside its results."""
     compared = dict[tuple[str, int], list[ArmRun]]()
     for run in runs:
         if run.seed == 0 and read(result_file(out, run)) is not None:

@@ -68,8 +68,11 @@ CHOOSING: dict[str, Measure] = {
 """In the rounds that choose: means over them."""
 
 
-def tell(found: Sequence[Json], expected: int, out: Path) -> list[Figure]:
-    """Print tables and keep them as CSV, draw charts; the figures, marked where runs are missing."""
+def tell(found: Sequence[Json], expected: int, out: Path, targets: bool = True) -> list[Figure]:
+    """Print tables and keep them as CSV, draw charts; the figures, marked where some of `expected` runs are missing.
+
+    targets: whether the default arm is held against the published figure, if no run is missing.
+    """
     comparisons = _grouped(found)
     partial = "" if len(found) >= expected else f", partial: {len(found)} of {expected} runs"
     if partial:
@@ -82,7 +85,7 @@ def tell(found: Sequence[Json], expected: int, out: Path) -> list[Figure]:
         with (out / f"5-{task}-{warm}.csv").open("w", newline="") as file:
             csv.writer(file).writerows(rows)
         explain(arms)
-        figures += _figures(task, warm, arms, partial)
+        figures += _figures(task, warm, arms, partial, targets)
     _draw(comparisons, out)
     return figures
 
@@ -139,12 +142,12 @@ def ratio(left: dict[int, Json], right: dict[int, Json], measured: Measure) -> f
     return sum(one for one, _ in pairs) / sum(other for _, other in pairs)
 
 
-def _figures(task: str, warm: int, arms: Results, partial: str) -> list[Figure]:
+def _figures(task: str, warm: int, arms: Results, partial: str, targets: bool) -> list[Figure]:
     """Every arm beside Random; the default arm with the published ratio as target."""
     random, told = arms.get(RANDOM.name, {}), list[Figure]()
     for arm, seeds in arms.items():
         if arm != RANDOM.name and seeds.keys() & random.keys():
-            target = PUBLISHED.get(task) if arm == DEFAULT.name and not partial else None
+            target = PUBLISHED.get(task) if targets and arm == DEFAULT.name and not partial else None
             name, value = f"5_{task}_{warm}_{arm}_of_random", ratio(seeds, random, error(32))
             told.append(Figure(name, value, f"ratio of errors at 32 steps{partial}", target, "below"))
         for measure, loss in (("own", rank("own")), ("decoded", rank("pixels"))):
