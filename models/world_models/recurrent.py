@@ -68,8 +68,8 @@ SMALL = RecurrentWorldModelConfig(
 class RecurrentWorldModel(nn.Module):
     """States are (B, D) = [h, z]; a state after one observation knows no velocities, so the burn-in is one observation.
 
-    Distances are nats, what the observations tell that the predicted states did not expect, or squared errors of what
-    these decode to, in the loss's units: the config says which.
+    Distances are nats, what the observations tell that the predicted states did not expect, or errors of what these
+    decode to: the config says which.
     """
 
     family = "robot"
@@ -142,7 +142,8 @@ class RecurrentWorldModel(nn.Module):
 
         divergence: sum_t KL(q(z_t | h_t, x_t) || p(z_t | h_t)) along predicted h_t, in nats: the information that each
         observation adds to what the rollout expected, which is the dynamics loss, open-loop. decoded: the squared error
-        of pixels and standardised numbers, weighed as in the loss. Raises ValueError for other shapes.
+        of pixels and, weighed as in the loss, ln(1 + it) of each standardised number, as of a Cauchy distribution.
+        Raises ValueError for other shapes.
         """
         found, expected = tuple(prediction.shape[:2]), _leading(reference)
         if found != expected:
@@ -194,13 +195,7 @@ class RecurrentWorldModel(nn.Module):
 
     def reconstruction(self, states: Tensor, frame: Frame) -> Tensor:
         """Squared error of what states (B, T, D) decode to, summed over a frame's pixels and numbers: (B, T)."""
-        decoded, seen = self._decoded(states.flatten(0, 1)), frame.flat(2)
-        parts = []
-        if decoded.pixels is not None and seen.pixels is not None:
-            parts.append(image.squared_error(decoded.pixels, seen.pixels))
-        if decoded.numbers is not None and seen.numbers is not None:
-            parts.append(self.config.numbers_weight * (decoded.numbers - seen.numbers).square().sum(1))
-        return torch.stack(parts).sum(0).view(states.shape[:2])
+        return self._missed(states.flatten(0, 1), frame.flat(2), tolerant=False).view(states.shape[:2])
 
     def disagreement(self, decoded: Sequence[Observations]) -> Tensor:
         """Variance over the members of what they decode, summed over pixels and numbers, weighted as in the loss."""
@@ -261,12 +256,25 @@ class RecurrentWorldModel(nn.Module):
 
     def _decoded_distance(self, prediction: Tensor, reference: Observations) -> Tensor:
         """A part of the frames at a time, as in `_read`."""
-        rows = {name: stream.flatten(0, 1).unsqueeze(1) for name, stream in reference.items()}
-        states, parts = prediction.flatten(0, 1).unsqueeze(1), []  # (B*L, 1, D)
+        rows, states = {name: stream.flatten(0, 1) for name, stream in reference.items()}, prediction.flatten(0, 1)
+        parts = []
         for start in range(0, max(1, len(states)), FRAMES):
             frame = self.streams.frame({name: stream[start : start + FRAMES] for name, stream in rows.items()})
-            parts.append(self.reconstruction(states[start : start + FRAMES], frame))
+            parts.append(self._missed(states[start : start + FRAMES], frame, tolerant=True))
         return torch.cat(parts).view(prediction.shape[:2]).sum(1)
+
+    def _missed(self, states: Tensor, frame: Frame, tolerant: bool) -> Tensor:
+        """Squared error of what states (N, D) decode to, summed over a frame's pixels and numbers: (N,).
+
+        tolerant: a number's counts as ln(1 + it), so that one which has never moved so far does not outweigh pictures.
+        """
+        decoded, parts = self._decoded(states), []
+        if decoded.pixels is not None and frame.pixels is not None:
+            parts.append(image.squared_error(decoded.pixels, frame.pixels))
+        if decoded.numbers is not None and frame.numbers is not None:
+            missed = (decoded.numbers - frame.numbers).square()
+            parts.append(self.config.numbers_weight * (missed.log1p() if tolerant else missed).sum(1))
+        return torch.stack(parts).sum(0)
 
     def _decoded(self, state: Tensor) -> Frame:
         frame: Frame = self.decoder(state)
