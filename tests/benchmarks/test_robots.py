@@ -34,12 +34,14 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     except SimulatorUnavailable as error:
         pytest.skip(str(error))
     root = tmp_path_factory.mktemp("robots")
-    folder, data = root / TINY.name, root / TINY.name / "data"
+    folder, data, threads = root / TINY.name, root / TINY.name / "data", torch.get_num_threads()
+    torch.set_num_threads(1)  # as the benchmark has it: networks as small as these only wait for each other's threads
     do(PolicyTraining(TINY.policy(TINY.tasks[0]), data), data)
     for recording in recordings_of(TINY):
         do(RecordingRun(recording, data), data)
     for run in runs_of(TINY, folder, "cpu"):
         do(run, folder)
+    torch.set_num_threads(threads)
     return root
 
 
