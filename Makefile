@@ -6,10 +6,11 @@ export PYTHONSAFEPATH := 1
 SEED ?= 0
 REPEAT ?= 50
 JOBS ?= 2
+PROFILE ?= small
 
 .PHONY: help setup setup-robots system demo serve test test-slow test-robots audit lint types imports format bench-acquire \
 	bench-score bench-import bench-simulators bench-labels bench-robot-projects bench-policies bench-world-model \
-	bench-paper-minigrid bench-paper-minigrid-full clean
+	bench-paper-minigrid bench-paper-minigrid-full bench-paper-robots clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -100,6 +101,9 @@ bench-paper-minigrid: setup ## the paper's MiniGrid figures, resumable (QUICK=1:
 
 bench-paper-minigrid-full: setup ## the same with every strategy under every batch rule: hours, resumable
 	$(BIN)/python -m benchmarks.paper.minigrid --full
+
+bench-paper-robots: setup-robots ## the paper's figure on manipulation, resumable (PROFILE=quick, small or paper; ARGS="--task Lift --device cuda")
+	$(BIN)/python -m benchmarks.paper.robots --profile $(PROFILE) $(ARGS)
 
 clean: ## remove .venv and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache *.egg-info

@@ -67,7 +67,7 @@ def open_loop_errors(
         raise ValueError(f"Segments of {batch.length} steps are too short for a horizon of {max(horizons)}.")
     total = dict[str, Tensor]()
     for start in range(0, batch.size, chunk):
-        for name, errors in _errors(world_model, batch.take(slice(start, start + chunk))).items():
+        for name, errors in step_errors(world_model, batch.take(slice(start, start + chunk))).items():
             total[name] = total.get(name, torch.zeros(())) + errors.sum(0).double().cpu()
         after_each()
     return {
@@ -76,9 +76,13 @@ def open_loop_errors(
     }
 
 
-def _errors(world_model: WorldModel, batch: SegmentBatch) -> dict[str, Tensor]:
-    """Of each stream, mean over coordinates: (B, L)."""
-    assert batch.actions is not None  # noqa: S101  # checked above
+def step_errors(world_model: WorldModel, batch: SegmentBatch) -> dict[str, Tensor]:
+    """Of each segment, stream and step, mean over coordinates: (B, L), as in `open_loop_errors`.
+
+    Raises ValueError for a batch without actions.
+    """
+    if batch.actions is None:
+        raise ValueError("Open-loop errors need labeled segments; the batch carries no actions.")
     prediction = world_model.rollout(world_model.infer_state(first(batch.observations)), batch.actions)
     steps = []
     for step, state in enumerate(prediction.unbind(1), 1):  # one step's images at a time

@@ -32,8 +32,11 @@ DATA = (
 )
 """What the simulator's own sets depend on."""
 CODE = (*DATA, "models", "workers/data.py", "workers/diagnosis.py", "workers/training.py", "benchmarks/paper")
-"""What results depend on; of explore mode's code only those that name it under `also`."""
+"""What results depend on; on code of ALL_CODE only those that name it under `also`."""
 EXPLORATION_CODE = ("models/exploration.py", "models/exploration_queue.py", "benchmarks/paper/minigrid/exploration.py")
+ROBOT_CODE = ("benchmarks/paper/robots",)
+"""What results on robots depend on beside CODE, and those on MiniGrid do not."""
+ALL_CODE = (*EXPLORATION_CODE, *ROBOT_CODE)
 TELLING = ("_table", "__main__", "charts", "drawing", "foreign_path", "picked_losses", "statistics", "through_service")
 """How the names of modules end that results do not depend on: they tell of them or ask for them."""
 LIBRARIES = ("gymnasium", "minigrid", "numpy", "torch")
@@ -48,7 +51,7 @@ class Run(Protocol):
         ...
 
     def results(self) -> Json:
-        """Do it. EXPLORATION_CODE is named under `also` where they depend on it."""
+        """Do it. EXPLORATION_CODE or ROBOT_CODE is named under `also` where they depend on it."""
         ...
 
 
@@ -72,7 +75,7 @@ def run_missing(runs: Sequence[Run], out: Path, processes: int, threads: int) ->
     context = multiprocessing.get_context("spawn")
     began = time.monotonic()
     with ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(threads,)) as pool:
-        futures = [pool.submit(do, run, out, code_digest(*EXPLORATION_CODE)) for run in missing]
+        futures = [pool.submit(do, run, out, code_digest(*ALL_CODE)) for run in missing]
         try:
             for done, future in enumerate(as_completed(futures), 1):
                 name, seconds = future.result()
@@ -110,16 +113,17 @@ def code_digest(*also: str) -> str:
 @cache
 def _digests() -> dict[tuple[str, ...], str]:
     """All at one moment: sources may change while a run lasts, and it began with the earlier ones."""
-    return {also: sources_digest(*CODE, *also) for also in ((), EXPLORATION_CODE)}
+    return {also: sources_digest(*CODE, *also) for also in ((), EXPLORATION_CODE, ROBOT_CODE, ALL_CODE)}
 
 
 @cache
 def sources_digest(*names: str) -> str:
     """Of Python files and folders of them below the root, but for modules that only tell; of Python and LIBRARIES.
 
-    Those of EXPLORATION_CODE count only where they are named themselves.
+    Those of ALL_CODE count only where they, or files in them, are named themselves.
     """
-    apart = {ROOT / name for name in EXPLORATION_CODE if name not in names}
+    left_out = [part for part in ALL_CODE if not any(f"{name}/".startswith(f"{part}/") for name in names)]
+    apart = {path for part in left_out for path in _sources(ROOT / part)}
     found = {path for name in names for path in _sources(ROOT / name) if not path.stem.endswith(TELLING)}
     files = sorted(found - apart)
     libraries = [f"{name} {version(name)}" for name in LIBRARIES]
@@ -149,7 +153,7 @@ def do(run: Run, out: Path, code: str | None = None) -> tuple[str, float]:
 
     code: the digest of all code with which the benchmark began. Raises RuntimeError where it is another by now.
     """
-    if code not in (None, code_digest(*EXPLORATION_CODE)):
+    if code not in (None, code_digest(*ALL_CODE)):
         raise RuntimeError("The code has changed since the benchmark began; start it again.")
     began = time.monotonic()
     found = run.results()

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -20,14 +21,16 @@ from models.segments import Observations, SegmentBatch
 from models.spaces import Spaces, bounded_box
 
 VISIBLE_GREY, VISIBLE = 16.0, 1e-3  # of 255 levels, and of a number: what is less is no change
-FRAMES = 512  # encoded at a time outside of training: bounds memory
+FRAMES = 512  # encoded or decoded at a time outside of training: bounds memory
+Distance = Literal["divergence", "decoded"]
 
 
 @dataclass(frozen=True)
 class RecurrentWorldModelConfig(RecurrentStateSpaceConfig, ObservationNetworkConfig):
     """The paper's preset. window: observations of a training sequence.
 
-    standardised: whether numbers are, besides symlog; numbers_weight: of their squared error in the loss.
+    standardised: whether numbers are, besides symlog; numbers_weight: of their squared error in the loss. distance:
+    what `distance` returns: nats of divergence in latent space, or the squared error of what is decoded.
     """
 
     window: int = 32
@@ -36,9 +39,12 @@ class RecurrentWorldModelConfig(RecurrentStateSpaceConfig, ObservationNetworkCon
     dynamics_weight: float = 0.5
     representation_weight: float = 0.1
     free_nats: float = 1.0
+    distance: Distance = "divergence"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.distance not in get_args(Distance):
+            raise ValueError(f"distance must be one of {', '.join(get_args(Distance))}, got {self.distance!r}.")
         if self.window < 2:
             raise ValueError(f"window must be at least 2, got {self.window}.")
 
@@ -62,7 +68,8 @@ SMALL = RecurrentWorldModelConfig(
 class RecurrentWorldModel(nn.Module):
     """States are (B, D) = [h, z]; a state after one observation knows no velocities, so the burn-in is one observation.
 
-    Distances are nats: what the observations tell that the predicted states did not expect.
+    Distances are nats, what the observations tell that the predicted states did not expect, or errors of what these
+    decode to: the config says which.
     """
 
     family = "robot"
@@ -131,17 +138,20 @@ class RecurrentWorldModel(nn.Module):
         return self.recurrence.imagine(state, self.action.unit(actions))
 
     def distance(self, prediction: Tensor, reference: Observations) -> Tensor:
-        """sum_t KL(q(z_t | h_t, x_t) || p(z_t | h_t)) along predicted h_t: (B, L, D), (B, L, ...) -> (B,) nats.
+        """Summed over the steps: (B, L, D), (B, L, ...) -> (B,), by the config's `distance`.
 
-        The information that each observation adds to what the rollout expected: the dynamics loss, open-loop. Raises
-        ValueError for other shapes.
+        divergence: sum_t KL(q(z_t | h_t, x_t) || p(z_t | h_t)) along predicted h_t, in nats: the information that each
+        observation adds to what the rollout expected, which is the dynamics loss, open-loop. decoded: the squared error
+        of pixels and, weighed as in the loss, ln(1 + it) of each standardised number, as of a Cauchy distribution.
+        Raises ValueError for other shapes.
         """
-        embeddings = self._read(reference)
-        if prediction.shape[:2] != embeddings.shape[:2]:
-            found, expected = tuple(prediction.shape[:2]), tuple(embeddings.shape[:2])
+        found, expected = tuple(prediction.shape[:2]), _leading(reference)
+        if found != expected:
             raise ValueError(f"predictions {found} are of other steps than {expected}.")
+        if self.config.distance == "decoded":
+            return self._decoded_distance(prediction, reference)
         h, _ = self.recurrence.split(prediction)
-        posterior = self.recurrence.posterior(h, embeddings)
+        posterior = self.recurrence.posterior(h, self._read(reference))
         return categorical.kl_divergence(posterior, self.recurrence.prior(h)).sum(1)
 
     def loss(self, batch: SegmentBatch, generator: torch.Generator) -> Tensor:
@@ -185,13 +195,7 @@ class RecurrentWorldModel(nn.Module):
 
     def reconstruction(self, states: Tensor, frame: Frame) -> Tensor:
         """Squared error of what states (B, T, D) decode to, summed over a frame's pixels and numbers: (B, T)."""
-        decoded, seen = self._decoded(states.flatten(0, 1)), frame.flat(2)
-        parts = []
-        if decoded.pixels is not None and seen.pixels is not None:
-            parts.append(image.squared_error(decoded.pixels, seen.pixels))
-        if decoded.numbers is not None and seen.numbers is not None:
-            parts.append(self.config.numbers_weight * (decoded.numbers - seen.numbers).square().sum(1))
-        return torch.stack(parts).sum(0).view(states.shape[:2])
+        return self._missed(states.flatten(0, 1), frame.flat(2), tolerant=False).view(states.shape[:2])
 
     def disagreement(self, decoded: Sequence[Observations]) -> Tensor:
         """Variance over the members of what they decode, summed over pixels and numbers, weighted as in the loss."""
@@ -237,7 +241,7 @@ class RecurrentWorldModel(nn.Module):
 
     def _read(self, observations: Observations) -> Tensor:
         """(B, T, ...) -> embeddings (B, T, E), a part of the frames at a time: as floats all may be too many."""
-        batch, steps = next(iter(observations.values())).shape[:2]
+        batch, steps = _leading(observations)
         rows = {name: stream.flatten(0, 1) for name, stream in observations.items()}
         parts = [
             self.encoder(self.streams.frame({name: stream[start : start + FRAMES] for name, stream in rows.items()}))
@@ -245,9 +249,36 @@ class RecurrentWorldModel(nn.Module):
         ]
         return torch.cat(parts).view(batch, steps, self.encoder.outputs)
 
+    def _decoded_distance(self, prediction: Tensor, reference: Observations) -> Tensor:
+        """A part of the frames at a time, as in `_read`."""
+        rows, states = {name: stream.flatten(0, 1) for name, stream in reference.items()}, prediction.flatten(0, 1)
+        parts = []
+        for start in range(0, max(1, len(states)), FRAMES):
+            frame = self.streams.frame({name: stream[start : start + FRAMES] for name, stream in rows.items()})
+            parts.append(self._missed(states[start : start + FRAMES], frame, tolerant=True))
+        return torch.cat(parts).view(prediction.shape[:2]).sum(1)
+
+    def _missed(self, states: Tensor, frame: Frame, tolerant: bool) -> Tensor:
+        """Squared error of what states (N, D) decode to, summed over a frame's pixels and numbers: (N,).
+
+        tolerant: a number's counts as ln(1 + it), so that one which has never moved so far does not outweigh pictures.
+        """
+        decoded, parts = self._decoded(states), []
+        if decoded.pixels is not None and frame.pixels is not None:
+            parts.append(image.squared_error(decoded.pixels, frame.pixels))
+        if decoded.numbers is not None and frame.numbers is not None:
+            missed = (decoded.numbers - frame.numbers).square()
+            parts.append(self.config.numbers_weight * (missed.log1p() if tolerant else missed).sum(1))
+        return torch.stack(parts).sum(0)
+
     def _decoded(self, state: Tensor) -> Frame:
         frame: Frame = self.decoder(state)
         return frame
+
+
+def _leading(observations: Observations) -> tuple[int, ...]:
+    """Segments and steps of streams (B, T, ...)."""
+    return tuple(next(iter(observations.values())).shape[:2])
 
 
 def _sign(x: Tensor, threshold: float) -> Tensor:

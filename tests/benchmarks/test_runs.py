@@ -9,7 +9,9 @@ import pytest
 
 from benchmarks.paper import runs
 from benchmarks.paper.runs import (
+    ALL_CODE,
     EXPLORATION_CODE,
+    ROBOT_CODE,
     Json,
     code_digest,
     do,
@@ -112,6 +114,17 @@ def test_results_depend_on_explore_mode_where_they_say_so(sources: Path, file: s
     assert [read(sources / f"{number}.json") is None for number in range(3)] == [False, True, True]
 
 
+def test_results_on_minigrid_do_not_depend_on_the_robots_code(sources: Path) -> None:
+    for number, also in enumerate(((), ROBOT_CODE)):
+        (sources / f"{number}.json").write_text(json.dumps({"code": code_digest(*also), "also": also}))
+    file = sources / "benchmarks" / "paper" / "robots" / "a.py"
+    file.parent.mkdir(parents=True)
+    file.write_text("x = 1")
+    _forget_digests()
+    assert [read(sources / f"{number}.json") is None for number in range(2)] == [False, True]
+    assert sources_digest("benchmarks/paper/robots/a.py") != sources_digest("benchmarks/paper/robots/b.py")
+
+
 @dataclass(frozen=True)
 class Edit:
     """Somebody edits the source meanwhile."""
@@ -128,7 +141,7 @@ class Edit:
 def test_results_bear_the_digest_of_the_code_that_their_run_began_with(sources: Path) -> None:
     (sources / "models" / "a.py").write_text("x = 1")
     began = sources_digest.__wrapped__(*runs.CODE)
-    do(Edit(sources / "models" / "a.py"), sources, code_digest(*EXPLORATION_CODE))
+    do(Edit(sources / "models" / "a.py"), sources, code_digest(*ALL_CODE))
     assert json.loads((sources / "edit.json").read_text())["code"] == began
     _forget_digests()
     assert read(sources / "edit.json") is None
@@ -146,4 +159,4 @@ def test_code_that_changes_under_a_benchmark_ends_it(tmp_path: Path, log: Path) 
     with pytest.raises(RuntimeError, match="The code has changed since the benchmark began"):
         do(Count(1, log), tmp_path, "earlier")
     assert not log.exists()
-    assert do(Count(1, log), tmp_path, code_digest(*EXPLORATION_CODE))[0] == "count1"
+    assert do(Count(1, log), tmp_path, code_digest(*ALL_CODE))[0] == "count1"

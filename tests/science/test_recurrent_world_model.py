@@ -108,6 +108,24 @@ def test_more_frames_than_are_read_at_a_time_make_no_difference(monkeypatch: pyt
     assert model.infer_state(nothing.observations, nothing.actions).shape == (0, toy_robot.TINY.state)
 
 
+def test_the_decoded_distance_is_the_logarithm_of_squared_errors_of_numbers(
+    point: RecurrentWorldModel, unseen: SegmentBatch
+) -> None:
+    decoded = _model(distance="decoded", numbers_weight=3.0)
+    decoded.load_state_dict(point.state_dict())
+    assert unseen.actions is not None
+    after = future(unseen.observations)
+    with torch.inference_mode():
+        prediction = decoded.rollout(decoded.infer_state(first(unseen.observations)), unseen.actions)
+        distance = decoded.distance(prediction, after)
+        guess = decoded.decode(prediction.flatten(0, 1))["numbers"].view(unseen.size, 8, 2)
+        truth = decoded.streams.frame(after).numbers
+    assert truth is not None
+    torch.testing.assert_close(distance, 3.0 * (1 + (guess - truth).square()).log().sum((1, 2)))
+    with pytest.raises(ValueError, match="distance must be one of divergence, decoded, got 'nearness'"):
+        _model(distance="nearness")
+
+
 def test_a_rollout_is_repeated_prediction(point: RecurrentWorldModel, unseen: SegmentBatch) -> None:
     assert unseen.actions is not None
     state = point.encode(at(unseen.observations, 0))

@@ -278,9 +278,9 @@ def test_explore_mode_has_a_robot_executed_along_the_worst_chains(opened: OpenLo
     assert (done.status, done.error) == ("current", None)
     batch = loop.acquire(4, "cycle", mode="explore")
     assert (batch.round, batch.strategy, len(batch.items)) == (done.id, "cycle", 4)
-    for item in batch.items:
-        assert np.shape(item.actions) == (1, 7)
-        assert bool((np.abs(np.array(item.actions)) <= 1).all())
+    actions = np.array([item.actions for item in batch.items])
+    assert actions.shape == (4, 1, 7)
+    assert bool((np.abs(actions) <= 1).all())
     before = loop.project.counts.labeled
     run_labeling(loop.client, batch, np.random.default_rng(0))
     assert loop.project.counts.labeled == before + 4
