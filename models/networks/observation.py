@@ -15,6 +15,10 @@ from models.networks.symlog import symexp, symlog
 from models.segments import Observations
 from models.spaces import Spaces, bounded_box
 
+FARTHEST = 10.0
+"""Standard deviations that a number counts at most: what early data hardly moves is soon hundreds of them away, and
+would outweigh all else in a loss or a distance."""
+
 
 class Frame(NamedTuple):
     """Observations as networks read and write them; None where the spaces have no such stream.
@@ -78,7 +82,9 @@ class Streams(nn.Module):
         if not self.vectors:
             return Frame(pixels, None)
         numbers = self._numbers(observations)
-        return Frame(pixels, numbers if self.moments is None else self.moments.standardised(numbers))
+        if self.moments is not None:
+            numbers = self.moments.standardised(numbers).clamp(-FARTHEST, FARTHEST)
+        return Frame(pixels, numbers)
 
     def restored(self, frame: Frame) -> Observations:
         """The reverse of `frame`, images still float in [0, 1]."""

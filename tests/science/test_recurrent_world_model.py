@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from models.networks.observation import FARTHEST
 from models.segments import Observations, SegmentBatch, at, first, future
 from models.spaces import BoxAction, DiscreteAction, Spaces, StreamSpec
 from models.training import NonFiniteError, TrainingConfig, TrainingState, advance, begin, train
@@ -263,3 +264,12 @@ def test_the_paper_s_preset_has_the_stated_sizes() -> None:
     images = {name: StreamSpec((64, 64, 3), "uint8") for name in ("front", "wrist")}
     spaces = Spaces({**images, "proprioception": StreamSpec((11,), "float32")}, BoxAction(-1.0, 1.0, (7,)))
     assert RecurrentWorldModel(spaces, PAPER, torch.Generator()).encoder.outputs == 5120
+
+
+def test_numbers_far_from_all_that_training_has_shown_count_ten_deviations() -> None:
+    model = RecurrentWorldModel(toy_robot.POINT, toy_robot.TINY, torch.Generator().manual_seed(0))
+    model.streams.measure(toy_robot.points(50, 4, seed=1).observations)
+    frame = model.streams.frame({"position": torch.tensor([[1e6, -1e6], [0.0, 0.0]])})
+    assert frame.numbers is not None
+    assert frame.numbers[0].tolist() == [FARTHEST, -FARTHEST]
+    assert bool((frame.numbers[1].abs() < 1).all())
