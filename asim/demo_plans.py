@@ -99,9 +99,9 @@ class RobotPlan:
     cameras: bool = True
     segment_length: int = 16
     seed_transitions: int = 2500
-    pool_transitions: int = 6000
-    test_transitions: int = 1800
-    batch_labels: int = 70
+    pool_transitions: int = 6500
+    test_transitions: int = 1600
+    batch_labels: int = 80
     batches: int = 2
     seed_labels: int = 0
 
