@@ -8,7 +8,7 @@ REPEAT ?= 50
 JOBS ?= 2
 PROFILE ?= small
 
-.PHONY: help setup setup-robots system demo serve test test-slow test-robots audit lint types imports format bench-acquire \
+.PHONY: help setup setup-robots system demo demo-robots serve test test-slow test-robots audit lint types imports format bench-acquire \
 	bench-score bench-import bench-simulators bench-labels bench-robot-projects bench-policies bench-world-model \
 	bench-paper-minigrid bench-paper-minigrid-full bench-paper-robots clean
 .DEFAULT_GOAL := help
@@ -39,6 +39,10 @@ system: ## Debian packages for everything, tests included (as root; otherwise pr
 
 demo: setup ## the whole loop on MiniGrid, the default strategy beside random, no server needed (SEED=n for another seed)
 	$(BIN)/asim demo --seed $(SEED)
+
+demo-robots: setup-robots ## the same loop on robot arms seen by two cameras, Lift and then PullCube (SEED=n)
+	$(BIN)/asim demo --simulator robosuite --seed $(SEED)
+	$(BIN)/asim demo --simulator maniskill --seed $(SEED)
 
 serve: setup ## the service on ./asim-data at http://127.0.0.1:8000
 	$(BIN)/asim serve

@@ -14,13 +14,13 @@ START_SECONDS = 120.0  # the first start on a cold machine reads torch from disk
 
 
 @contextmanager
-def served(folder: Path, runners: int = 1, host: str = "127.0.0.1") -> Iterator[str]:
+def served(folder: Path, runners: int = 1, host: str = "127.0.0.1", collectors: int = 1) -> Iterator[str]:
     """Run `asim serve` on `folder` and a free port of `host`; yields its URL. Its output goes to `serve.log` there.
 
     Raises AsimError where the process ends by itself, with the end of its log.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    options = {"--data": folder, "--host": host, "--port": 0, "--runners": runners}
+    options = {"--data": folder, "--host": host, "--port": 0, "--runners": runners, "--collectors": collectors}
     argv = [sys.executable, "-m", "asim", "serve", *(str(word) for option in options.items() for word in option)]
     log = folder / "serve.log"
     with log.open("w") as output:

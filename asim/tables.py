@@ -14,10 +14,16 @@ from api_schemas.jobs import Job
 from api_schemas.keys import Key
 from api_schemas.policies import Policy
 from api_schemas.projects import Project
-from api_schemas.rounds import ModelError, ModelErrorCurve, Round
+from api_schemas.rounds import ModelErrorCurve, Round
+from asim import measures
 
 WIDTH_WITHOUT_TERMINAL = 200
 TEXT = ("id", "trajectory", "environment", "strategy", "actions", "kind", "state", "message", "error")
+
+STANDING_STILL = (
+    "not foreseen: of what changes in whole segments after their first observation; on the right, squared errors over "
+    "all their steps, of images per pixel in [0, 1] / those of a prediction that nothing moves"
+)
 
 
 def show(table: Table) -> None:
@@ -100,28 +106,24 @@ def warning_lines(name: str, shown: Round) -> list[str]:
 
 
 def error_table(curves: Mapping[str, ModelErrorCurve], first_column: str = "project") -> Table:
-    """One row a round: loss in nats a transition, Dynamics Accuracy overall and by action group."""
-    groups = sorted(
-        {group for curve in curves.values() for point in curve.points for group in point.model_error.by_group}
-    )
-    accuracies = ["Dynamics Accuracy", *reversed(groups)]
-    table = _table(first_column, "labels", "test loss", *accuracies)
+    """One row a round: loss (of grids nats a transition, of robots the share of what changes that is not foreseen),
+    Dynamics Accuracy overall and by action group, and of robots the open-loop error over whole segments by stream."""
+    errors = measures.errors_of(curves)
+    open_loop = measures.open_loop(errors)
+    columns = [*measures.losses(errors), measures.ACCURACY, *measures.groups(errors), *open_loop]
+    table = _table(first_column, "labels", *(column.title for column in columns))
+    if open_loop:
+        table.caption, table.caption_justify = STANDING_STILL, "left"
     for name, curve in curves.items():
         for point in curve.points:
-            last = point is curve.points[-1]
-            table.add_row(name, str(point.labels), *_error_cells(point.model_error, accuracies[1:]), end_section=last)
+            cells = (column.told(point.model_error) for column in columns)
+            table.add_row(name, str(point.labels), *cells, end_section=point is curve.points[-1])
     return table
 
 
 def _printable(line: str) -> str:
     """What users typed may hold control characters; a terminal would obey them."""
     return "".join(each if each.isprintable() else f"\\u{ord(each):04x}" for each in line)
-
-
-def _error_cells(error: ModelError, groups: Sequence[str]) -> list[str]:
-    loss = "-" if error.loss is None else f"{error.loss:.4f}"
-    by_group = [error.by_group[group].dynamics_accuracy if group in error.by_group else None for group in groups]
-    return [loss, *("-" if share is None else f"{share:.1%}" for share in (error.dynamics_accuracy, *by_group))]
 
 
 def _table(first: str, *others: str) -> Table:

@@ -72,6 +72,9 @@ def alive(
 
 
 def demo(
+    *,
+    simulator: Annotated[str, typer.Option(help="minigrid; or of robots: maniskill, robosuite.")] = "minigrid",
+    task: Annotated[str | None, typer.Option(help="Of a robot simulator; default its first.")] = None,
     seed: Annotated[int, typer.Option(min=0, envvar="SEED", help="Of data, labels and networks.")] = 0,
     keep: Annotated[Path | None, typer.Option(help="Keep the service's data in this folder.")] = None,
     url: Annotated[
@@ -79,14 +82,16 @@ def demo(
     ] = None,
     key: Key = None,
 ) -> None:
-    """Run the loop on MiniGrid with the default strategy and random side by side, and compare their model errors."""
-    from asim.demo import Service
+    """Run the loop with the default strategy and random side by side, and compare their model errors."""
     from asim.demo import demo as run_demo
+    from asim.demo_arm import Service
+    from asim.demo_plans import plan_of
     from asim.errors import AsimError
 
     if url is not None and keep is not None:
         raise AsimError(f"--keep {keep}: the service at --url {url} keeps its data itself; give one of the two")
-    run_demo(seed, keep, service=None if url is None else Service(url, key, f"demo-{datetime.now(UTC):%Y%m%d-%H%M%S}"))
+    service = None if url is None else Service(url, key, f"demo-{datetime.now(UTC):%Y%m%d-%H%M%S}")
+    run_demo(seed, keep, plan_of(simulator, task), service)
 
 
 def settings_of(data: Path | None) -> "Settings":

@@ -25,6 +25,9 @@ def create(
     simulator: Annotated[str | None, typer.Option(help="One that we ship: maniskill, minigrid, robosuite.")] = None,
     option: Annotated[list[str] | None, typer.Option(help="Of the simulator, as name=value; repeatable.")] = None,
     spaces: Annotated[Path | None, typer.Option(help="JSON file with the spaces of your own environment.")] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="Size of the robots' networks and of their training, small (default) or paper.")
+    ] = None,
     strategy: Strategy = None,
     round_labels: RoundLabels = None,
     label_budget: LabelBudget = None,
@@ -42,6 +45,7 @@ def create(
     project = ProjectCreate(
         name=name,
         environment=_environment(simulator, option or [], spaces),
+        preset=preset,  # type: ignore[arg-type]  # the schema says which there are
         segment_length=segment_length,
         stride=stride,
         held_out_fraction=held_out_fraction,

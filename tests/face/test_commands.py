@@ -121,6 +121,19 @@ def test_a_policy_is_changed_field_by_field(asim: Command, own: str) -> None:
     assert re.search(rf"{own} .* random .* 5\b", asim("project", "list"))
 
 
+def test_a_robot_project_is_created_in_a_preset(asim: Command, tmp_path: Path) -> None:
+    for name, words, preset in (("a", (), "small"), ("b", ("--preset", "paper"), "paper")):
+        asim("project", "create", f"{tmp_path.name}-{name}", "--simulator", "robosuite", *words)
+        told = json.loads(asim("project", "show", f"{tmp_path.name}-{name}"))
+        assert (told["family"], told["preset"]) == ("robot", preset)
+    refused = {
+        ("--simulator", "minigrid", "--preset", "small"): "preset: 'small' is for the robot family",
+        ("--simulator", "robosuite", "--preset", "huge"): "preset: Input should be 'small' or 'paper'",
+    }
+    for mistake, sentence in refused.items():
+        assert sentence in asim("project", "create", "x", *mistake, status=1)
+
+
 def test_mistakes_cost_one_sentence(asim: Command, own: str, tmp_path: Path) -> None:
     (tmp_path / "text.npz").write_text("no npz")
     mistakes = {

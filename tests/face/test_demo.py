@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from asim.demo import DemoPlan, demo
+from asim.demo import demo
+from asim.demo_plans import DemoPlan
 from asim.errors import AsimError
 
 SMALL = DemoPlan(

@@ -7,7 +7,7 @@ from uuid import uuid4
 
 from rich.console import Console
 
-from api_schemas.rounds import GroupError, ModelError, ModelErrorCurve, ModelErrorPoint, Round
+from api_schemas.rounds import GroupError, ModelError, ModelErrorCurve, ModelErrorPoint, OpenLoopError, Round
 from asim.figure import draw_learning_curves
 from asim.tables import error_table, warning_lines
 
@@ -33,6 +33,41 @@ def curve(losses: dict[int, float | None]) -> ModelErrorCurve:
         for number, (labels, loss) in enumerate(losses.items(), 1)
     ]
     return ModelErrorCurve(project=uuid4(), points=points)
+
+
+def robots(losses: dict[int, float]) -> ModelErrorCurve:
+    """A curve of errors of which each is that share of what standing still errs by."""
+    still = {"front": 0.02, "proprioception": 0.001}
+    points = [
+        point.model_copy(
+            update={
+                "model_error": ModelError(
+                    transitions=10,
+                    loss=losses[point.labels],
+                    dynamics_accuracy=0.5,
+                    inverse_accuracy=0.5,
+                    open_loop=[
+                        OpenLoopError(
+                            horizon=horizon,
+                            errors={name: losses[point.labels] * each for name, each in still.items()},
+                            standing_still=still,
+                        )
+                        for horizon in (8, 16)
+                    ],
+                )
+            }
+        )
+        for point in curve(dict.fromkeys(losses)).points
+    ]
+    return ModelErrorCurve(project=uuid4(), points=points)
+
+
+def table_lines(curves: dict[str, ModelErrorCurve]) -> list[list[str]]:
+    """The words of each line that a terminal of 160 columns shows."""
+    console = Console(width=160, record=True)
+    with console.capture() as captured:
+        console.print(error_table(curves))
+    return [line.split() for line in captured.get().splitlines() if line.strip()]
 
 
 def test_the_figure_is_a_png_of_readable_size(tmp_path: Path) -> None:
@@ -61,6 +96,32 @@ def test_the_table_shows_each_round_and_marks_unknown_numbers() -> None:
         ["cycle", "200", "0.5000", "50.0%", "90.0%", "-"],
         ["cycle", "300", "0.2500", "75.0%", "90.0%", "-"],
     ]
+
+
+def test_the_table_of_robots_says_what_is_not_foreseen_and_the_errors_at_the_end_of_segments() -> None:
+    head, *rows = table_lines({"lift": robots({150: 0.75, 220: 0.5})})
+    assert " ".join(head) == ("project labels not foreseen Dynamics Accuracy front, 16 steps proprioception, 16 steps")
+    assert rows[:2] == [
+        ["lift", "150", "75.0%", "50.0%", "0.0150", "/", "0.0200", "0.0008", "/", "0.0010"],
+        ["lift", "220", "50.0%", "50.0%", "0.0100", "/", "0.0200", "0.0005", "/", "0.0010"],
+    ]
+    assert "that nothing moves" in " ".join(word for row in rows[2:] for word in row)
+
+
+def test_nats_and_shares_have_columns_of_their_own() -> None:
+    head, grid, robot, *_ = table_lines({"rooms": curve({200: 0.5}), "lift": robots({150: 0.75})})
+    assert head[:6] == ["project", "labels", "test", "loss", "not", "foreseen"]
+    assert grid[:4] == ["rooms", "200", "0.5000", "-"]
+    assert robot[:4] == ["lift", "150", "-", "75.0%"]
+
+
+def test_the_figure_of_robots_has_a_chart_for_each_stream(tmp_path: Path) -> None:
+    path = tmp_path / "robots.png"
+    draw_learning_curves({"cycle": robots({150: 0.75, 220: 0.5})}, path)
+    robot_width, _ = struct.unpack(">II", path.read_bytes()[16:24])
+    draw_learning_curves({"cycle": curve({150: 0.75, 220: 0.5})}, path)
+    grid_width, _ = struct.unpack(">II", path.read_bytes()[16:24])
+    assert robot_width / grid_width == 3 / 2  # what is not foreseen and two streams; loss and accuracy
 
 
 def warned(*warnings: str) -> Round:

@@ -26,6 +26,7 @@ from api_schemas.rounds import (
     ModelError,
     ModelErrorCurve,
     ModelErrorPoint,
+    OpenLoopError,
     Round,
     RoundStatus,
     Stage,
@@ -71,7 +72,12 @@ class CannedApi:
         return project.id
 
     def add_round(
-        self, project: UUID, loss: float | None, status: RoundStatus = "current", warnings: list[str] | None = None
+        self,
+        project: UUID,
+        loss: float | None,
+        status: RoundStatus = "current",
+        warnings: list[str] | None = None,
+        open_loop: list[OpenLoopError] | None = None,
     ) -> Round:
         own = [each for each in self.rounds if each.project == project]
         number = len(own) + 1
@@ -79,7 +85,7 @@ class CannedApi:
         round_ = Round(
             id=uuid4(), project=project, number=number, watermark=100 * number, labels=100 * number, status=status,
             stages=[Stage(name="inverse_dynamics", seconds=14.2), Stage(name="world_model", seconds=48.75)], models={},
-            model_error=None if loss is None else model_error(loss),
+            model_error=None if loss is None else model_error(loss, open_loop),
             diagnostics=None if warnings is None else diagnostics(warnings), job=uuid4(),
             error="segment 3f at 12: loss is nan" if status == "failed" else None,
             created_at=START + timedelta(minutes=20 * number),
@@ -135,17 +141,16 @@ class CannedApi:
         return ModelErrorCurve(project=project, points=points)
 
 
-def model_error(loss: float) -> ModelError:
-    """A model error with this loss, the rest made up from it."""
+def model_error(loss: float, open_loop: list[OpenLoopError] | None = None) -> ModelError:
+    """A model error with this loss, the rest made up from it; with open-loop errors, that of a robot."""
     groups = {
         name: GroupError(
             transitions=50, loss=loss * hard, dynamics_accuracy=1 - 0.1 * loss * hard, inverse_accuracy=0.9
         )
         for name, hard in (("movement", 0.6), ("interaction", 1.7))
     }
-    return ModelError(
-        transitions=200, loss=loss, dynamics_accuracy=1 - 0.1 * loss, inverse_accuracy=0.93, by_group=groups
-    )
+    figures = ModelError(transitions=200, loss=loss, dynamics_accuracy=1 - 0.1 * loss, inverse_accuracy=0.93)
+    return figures.model_copy(update={"open_loop": open_loop} if open_loop else {"by_group": groups})
 
 
 def diagnostics(warnings: list[str]) -> Diagnostics:

@@ -6,6 +6,7 @@ from uuid import uuid4
 
 from playwright.sync_api import Page, expect
 
+from api_schemas.rounds import OpenLoopError
 from tests.pages.canned_api import CannedApi, serving
 from tests.pages.conftest import Site
 
@@ -155,6 +156,54 @@ def test_a_second_project_is_overlaid_and_the_address_keeps_it(api: CannedApi, s
     page.get_by_role("link", name="random").click()
     expect(page.locator("#project-name")).to_have_text("random")
     expect(page.locator("#chart-loss .plot .point")).to_have_count(3)
+
+
+def open_loop(share: float) -> list[OpenLoopError]:
+    """At two horizons; of what standing still errs by, this share."""
+    still = {"front": 0.02, "proprioception": 0.005}
+    return [
+        OpenLoopError(
+            horizon=horizon,
+            errors={name: share * part * each for name, each in still.items()},
+            standing_still={name: part * each for name, each in still.items()},
+        )
+        for horizon, part in ((8, 0.5), (16, 1.0))
+    ]
+
+
+def test_a_robots_loss_is_a_share_and_its_rounds_tell_their_open_loop_errors(
+    api: CannedApi, site: Site, page: Page
+) -> None:
+    project, grid = api.add_project("lift", labeled=200), api.add_project("rooms", labeled=100)
+    api.update_project(project, family="robot")
+    for share in (0.75, 0.5):
+        api.add_round(project, share, open_loop=open_loop(share))
+    api.add_round(grid, 2.5)
+    page.goto(f"{site.address}/dashboard#project={project}&compare={grid}")
+    expect(page.locator("#loss-unit")).to_have_text("share of what changes that is not foreseen, lower is better")
+    expect(page.locator("#chart-loss .plot .point")).to_have_count(2)  # nats do not stand on an axis of shares
+    expect(page.locator("#curve-empty")).to_have_text("The loss of rooms is of another kind.")
+    expect(page.locator("#chart-loss .tick").filter(has_text="%")).not_to_have_count(0)
+    expect(page.locator("#error tbody tr").first).to_have_text("overall50.0 %95.0 %93.0 %")
+    newest = page.locator("#error").get_by_role("region", name="Open-loop errors of round 2")
+    expect(newest.locator("tbody tr")).to_have_text(
+        [
+            "front, 8 steps0.005000.0100",
+            "proprioception, 8 steps0.001250.00250",
+            "front, 16 steps0.01000.0200",
+            "proprioception, 16 steps0.002500.00500",
+        ]
+    )
+    first = page.locator("#rounds [aria-label='Open-loop errors of round 1']")
+    expect(first).to_be_hidden()
+    page.locator("#rounds summary").last.click()
+    expect(first.locator("tbody tr").last).to_have_text("proprioception, 16 steps0.003750.00500")
+    api.add_round(project, 0.25, open_loop=open_loop(0.25))
+    expect(page.locator("#rounds summary")).to_have_count(3)
+    expect(first).to_be_visible()  # what was unfolded stays so
+    page.get_by_role("link", name="rooms").click()
+    expect(page.locator("#loss-unit")).to_have_text("nats a transition, lower is better")
+    expect(page.locator("#rounds summary")).to_have_count(0)
 
 
 def test_an_empty_service_and_an_empty_project_say_what_to_do_next(api: CannedApi, site: Site, page: Page) -> None:

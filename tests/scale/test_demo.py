@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from asim.demo import STRATEGIES, DemoPlan, Service, demo
+from asim.demo import STRATEGIES, demo
+from asim.demo_arm import Service
+from asim.demo_plans import DemoPlan
 from tests.figures import Figures
 from tests.scale.conftest import Deploy
 

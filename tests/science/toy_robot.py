@@ -1,10 +1,16 @@
 """Robots whose rules are known: a point that an action moves, in numbers, and the same as a picture of a square."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
+from models.families import RobotPreset
+from models.inverse_dynamics import latent_action, latent_gates
 from models.segments import Observations, Segment, SegmentBatch
 from models.spaces import BoxAction, Spaces, StreamSpec
+from models.subgoal_generators import latent
+from models.training import TrainingConfig
 from models.world_models.recurrent import RecurrentWorldModel, RecurrentWorldModelConfig
 
 STEP = 0.3  # of an action of 1; the world ends at -1 and 1
@@ -24,6 +30,25 @@ TINY = RecurrentWorldModelConfig(
     reads_first=True,
     standardised=True,
     numbers_weight=100.0,
+)
+SHORT = TrainingConfig(20, 16, 1e-2, 1e-2)
+PRESET = RobotPreset(
+    TINY,
+    replace(latent_action.SMALL, width=16, heads=1, hidden=16, actor=(16,)),
+    latent_gates.SMALL,
+    latent.SMALL,
+    {
+        "world_model": TrainingConfig(150, 16, 1e-2, 0.0, clip=100.0),
+        "inverse_dynamics": SHORT,
+        "dense_inverse_dynamics": SHORT,
+        "masked_inverse_dynamics": SHORT,
+        "subgoal_generator": SHORT,
+    },
+    {
+        "world_model": TrainingConfig(50, 16, 3e-3, 0.0, clip=100.0),
+        **dict.fromkeys(("inverse_dynamics", "dense_inverse_dynamics", "masked_inverse_dynamics"), SHORT),
+        "subgoal_generator": SHORT,
+    },
 )
 
 

@@ -15,10 +15,7 @@ from api_schemas.projects import LabelingPolicy, ProjectCreate
 from api_schemas.rounds import Round
 from asim.errors import ServiceError
 from models import families
-from models.families import RobotFamily, RobotPreset
-from models.inverse_dynamics import latent_action, latent_gates
-from models.subgoal_generators import latent
-from models.training import TrainingConfig
+from models.families import RobotFamily
 from models.world_models.recurrent import RecurrentWorldModel
 from tests.science import toy_robot
 from tests.workers.conftest import OpenLoop, new_project
@@ -34,25 +31,7 @@ SPACES = {
     "observations": {"position": {"dtype": "float32", "shape": [2]}},
     "actions": {"kind": "box", "shape": [2]},
 }
-SHORT = TrainingConfig(20, 16, 1e-2, 1e-2)
-TINY = RobotPreset(
-    toy_robot.TINY,
-    replace(latent_action.SMALL, width=16, heads=1, hidden=16, actor=(16,)),
-    latent_gates.SMALL,
-    latent.SMALL,
-    {
-        "world_model": TrainingConfig(150, 16, 1e-2, 0.0, clip=100.0),
-        "inverse_dynamics": SHORT,
-        "dense_inverse_dynamics": SHORT,
-        "masked_inverse_dynamics": SHORT,
-        "subgoal_generator": SHORT,
-    },
-    {
-        "world_model": TrainingConfig(50, 16, 3e-3, 0.0, clip=100.0),
-        **dict.fromkeys(("inverse_dynamics", "dense_inverse_dynamics", "masked_inverse_dynamics"), SHORT),
-        "subgoal_generator": SHORT,
-    },
-)
+TINY = toy_robot.PRESET
 PRESETS = families.PRESETS["robot"]
 
 

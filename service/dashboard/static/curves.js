@@ -2,6 +2,7 @@
 
 import { drawChart } from "./chart.js";
 import { byId, figure, h, redraw, words } from "./dom.js";
+import { lossOf } from "./errors.js";
 
 const hidden = new Set(); // action groups whose accuracy is not wanted
 
@@ -42,19 +43,24 @@ function accuracyKeys(curves, groups, series) {
   return [...projects, ...shown];
 }
 
-/** Draw both charts; curves: [{name, points}], the chosen project first. */
+/** Draw both charts; curves: [{name, points, family}], the chosen project first: losses of another kind are left out. */
 export function drawCurves(curves, emptyText) {
   const some = curves.some((curve) => curve.points.length > 0);
   const groups = groupsOf(curves);
   const without = curves.slice(1).filter((curve) => !curve.points.length).map((curve) => curve.name);
-  const gaps = [curves[0].points.length ? "" : emptyText, without.length ? `No model error yet in ${without.join(", ")}.` : ""];
+  const loss = lossOf(curves[0].family);
+  const alike = curves.filter((curve) => lossOf(curve.family) === loss);
+  const unlike = curves.filter((curve) => curve.points.length && !alike.includes(curve)).map((curve) => curve.name);
+  const other = unlike.length ? `The loss of ${unlike.join(", ")} is of another kind.` : "";
+  byId("loss-unit").textContent = loss.unit;
+  const gaps = [curves[0].points.length ? "" : emptyText, other, without.length ? `No model error yet in ${without.join(", ")}.` : ""];
   byId("curve-empty").textContent = gaps.filter(Boolean).join(" ");
   byId("curve-empty").hidden = !byId("curve-empty").textContent;
   document.querySelector(".charts").hidden = !some;
   drawGroups(groups, some, () => drawCurves(curves, emptyText));
   if (!some) return;
-  const loss = lossSeries(curves).filter((each) => each.points.length);
-  draw("chart-loss", { label: "Test loss", series: loss, keys: loss, fromZero: true, format: figure });
+  const losses = lossSeries(alike).filter((each) => each.points.length);
+  draw("chart-loss", { label: "Test loss", series: losses, keys: losses, fromZero: true, format: loss.axis });
   const share = (value) => `${figure(100 * value)} %`;
   const accuracy = accuracySeries(curves, groups).filter((each) => each.points.length);
   const keys = accuracyKeys(curves, groups, accuracy);

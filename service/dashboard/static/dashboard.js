@@ -55,13 +55,14 @@ function draw() {
   if (!state.answers) return void notice();
   const { about, own, others, strip, rounds, jobs, events } = state.answers;
   const advice = sections.curveAdvice(about, rounds);
-  const nameOf = (id) => projects.find((each) => each.id === id)?.name ?? id.slice(0, 8);
+  const known = (id) => projects.find((each) => each.id === id);
+  const compared = others.map((each) => ({ name: known(each.project)?.name ?? each.project.slice(0, 8), points: each.points, family: known(each.project)?.family }));
   document.title = `${about.name} – ASIM`;
   sections.drawHead(about);
   sections.drawRound(about, rounds, jobs);
   sections.drawLabels(about);
-  sections.drawError(own.points, advice);
-  drawCurves([{ name: about.name, points: own.points }, ...others.map((each) => ({ name: nameOf(each.project), points: each.points }))], advice);
+  sections.drawError(own.points, advice, about.family);
+  drawCurves([{ name: about.name, points: own.points, family: about.family }, ...compared], advice);
   drawCompare(projects.filter((each) => each.id !== project), compare, toggle);
   drawStrip(strip);
   sections.drawRounds(rounds, about);

@@ -18,13 +18,16 @@ export const byId = (id) => document.getElementById(id);
 
 const drawn = new WeakMap();
 
-/** Redraw `container` if `data` changed since the last time; the element in focus, named by data-key, keeps the focus. */
+/** Redraw `container` if `data` changed since the last time. By their data-key the element in focus keeps the focus, and
+ * details that were unfolded stay so. */
 export function redraw(container, data, draw) {
   const print = JSON.stringify(data);
   if (drawn.get(container) === print) return;
   drawn.set(container, print);
   const focused = container.contains(document.activeElement) ? document.activeElement.dataset.key : undefined;
+  const unfolded = new Set([...container.querySelectorAll("details[open]")].map((each) => each.dataset.key));
   container.replaceChildren(...[draw()].flat().filter((child) => child != null));
+  for (const each of container.querySelectorAll("details[data-key]")) each.open = unfolded.has(each.dataset.key);
   if (focused) [...container.querySelectorAll("[data-key]")].find((each) => each.dataset.key === focused)?.focus();
 }
 
@@ -68,3 +71,12 @@ export function refreshTimes() {
 export const badge = (state) => h("span", { class: "badge", "data-state": state }, words(state));
 export const empty = (...children) => h("p", { class: "empty-line" }, ...children);
 export const code = (text) => h("code", {}, text);
+
+/** A table that scrolls by itself where it is too wide; each row begins with its name. */
+export function table(heads, rows, caption) {
+  const cells = (row) => row.map((cell, i) => (i ? h("td", {}, cell) : h("th", { scope: "row" }, cell)));
+  return h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": caption, "data-key": caption },
+    h("table", {}, h("caption", { class: "unseen" }, caption),
+      h("thead", {}, h("tr", {}, ...heads.map((head) => h("th", { scope: "col" }, head)))),
+      h("tbody", {}, ...rows.map((row) => h("tr", {}, ...cells(row))))));
+}

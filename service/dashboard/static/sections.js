@@ -1,6 +1,7 @@
 // The parts of the page, each drawn from API answers.
 
-import { badge, byId, code, count, digits, duration, empty, h, percent, plural, redraw, when, words } from "./dom.js";
+import { badge, byId, code, count, duration, empty, h, percent, plural, redraw, table, when, words } from "./dom.js";
+import { lossOf, openLoopDetails, openLoopTable } from "./errors.js";
 
 const WORKING = ["queued", "training", "scoring"];
 const NO_FAMILY = "No model family takes this project's spaces: it keeps data and labels, and trains nothing.";
@@ -119,38 +120,35 @@ export function curveAdvice(project, rounds) {
   return "No model error yet: start a round, or add labels until one starts by itself.";
 }
 
-/** The model error of the newest point of the curve, overall and by action group. */
-export function drawError(points, advice) {
+/** The model error of the newest point of the curve, overall and by action group; of robots open-loop errors too. */
+export function drawError(points, advice, family) {
   const last = points.at(-1);
-  redraw(byId("error"), [last, advice], () => {
+  redraw(byId("error"), [last, advice, family], () => {
     if (!last) return empty(advice);
     const error = last.model_error;
-    const rows = [["overall", error], ...Object.entries(error.by_group)].map(([name, each]) => [words(name), digits(each.loss), percent(each.dynamics_accuracy), percent(each.inverse_accuracy)]);
+    const loss = lossOf(family);
+    const rows = [["overall", error], ...Object.entries(error.by_group)].map(([name, each]) => [words(name), loss.text(each.loss), percent(each.dynamics_accuracy), percent(each.inverse_accuracy)]);
     return [
-      table(["", "loss", "dynamics", "inverse"], rows, "Test loss, dynamics accuracy and inverse accuracy by action group"),
+      table(["", loss.name, "dynamics", "inverse"], rows, "Test loss, dynamics accuracy and inverse accuracy by action group"),
       h("p", { class: "hint" }, `Round ${last.number}, on ${plural(error.transitions, "held-out transition")}`),
+      error.open_loop.length ? openLoopTable(error, last.number) : null,
     ];
   });
-}
-
-function table(heads, rows, caption) {
-  const cells = (row) => row.map((cell, i) => (i ? h("td", {}, cell) : h("th", { scope: "row" }, cell)));
-  return h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": caption, "data-key": caption },
-    h("table", {}, h("caption", { class: "unseen" }, caption),
-      h("thead", {}, h("tr", {}, ...heads.map((head) => h("th", { scope: "col" }, head)))),
-      h("tbody", {}, ...rows.map((row) => h("tr", {}, ...cells(row))))));
 }
 
 /** Rounds, newest first. */
 export function drawRounds(rounds, project) {
   redraw(byId("rounds"), [rounds, project.policy.round_labels, project.counts.labeled > 0], () => {
     if (!rounds.length) return firstRound(project);
+    const loss = lossOf(project.family);
+    const robots = rounds.some((round) => round.model_error?.open_loop.length);
     const row = (round) => [
       round.number, h("span", {}, badge(round.status), round.error ? h("span", { class: "error" }, ` ${round.error}`) : null),
-      count(round.labels), digits(round.model_error?.loss), percent(round.model_error?.dynamics_accuracy),
+      count(round.labels), loss.text(round.model_error?.loss), percent(round.model_error?.dynamics_accuracy), ...(robots ? [openLoopDetails(round)] : []),
       round.finished_at ? duration((new Date(round.finished_at) - new Date(round.created_at)) / 1000) : "–", when(round.created_at),
     ];
-    return table(["round", "status", "labels", "loss", "dynamics", "took", "asked for"], rounds.map(row), "Rounds, newest first");
+    const heads = ["round", "status", "labels", loss.name, "dynamics", ...(robots ? ["open loop"] : []), "took", "asked for"];
+    return table(heads, rounds.map(row), "Rounds, newest first");
   });
 }
 
