@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from asim.demo import STRATEGIES, demo
 from asim.demo_arm import Service
@@ -48,6 +49,15 @@ def small(simulator: str) -> RobotPlan:
     )
 
 
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """As a runner of its own has."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @contextmanager
 def service(folder: Path) -> Iterator[Service]:
     """The API and one runner for all queues, in threads."""
@@ -63,7 +73,7 @@ def service(folder: Path) -> Iterator[Service]:
             thread.join()
 
 
-@pytest.mark.parametrize("simulator", ROBOTS)
+@pytest.mark.parametrize("simulator", [pytest.param("robosuite", marks=pytest.mark.robots), "maniskill"])
 def test_the_demo_of_a_robot_compares_two_arms_that_start_alike(
     simulator: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
