@@ -30,7 +30,7 @@ ROUND = sa.table(
     sa.column("model_error", JSON),
 )
 JOB = sa.table("job", sa.column("id", sa.Uuid()), sa.column("kind"), sa.column("payload", JSON))
-PARENT = op.f("fk_model_version_parent_id_model_version")
+PARENT = "fk_model_version_parent_id_model_version"
 
 
 def upgrade() -> None:
@@ -38,13 +38,13 @@ def upgrade() -> None:
         altered.add_column(sa.Column("preset", sa.String(40), nullable=True))
     with op.batch_alter_table("model_version") as altered:
         altered.add_column(sa.Column("parent_id", sa.Uuid(), nullable=True))
-        altered.create_foreign_key(PARENT, "model_version", ["parent_id"], ["id"])
+        altered.create_foreign_key(op.f(PARENT), "model_version", ["parent_id"], ["id"])
 
 
 def downgrade() -> None:
     """Older services train nothing on robots, and refuse documents with more in them than they know."""
     with op.batch_alter_table("model_version") as altered:
-        altered.drop_constraint(PARENT, type_="foreignkey")
+        altered.drop_constraint(op.f(PARENT), type_="foreignkey")
         altered.drop_column("parent_id")
     with op.batch_alter_table("project") as altered:
         altered.drop_column("preset")
