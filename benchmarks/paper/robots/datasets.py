@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from api_schemas.environments import GRIPPER
 from benchmarks.paper.runs import Json, sources_digest, write_at_once
 from models import checkpoints
 from models.policies.diffusion import DiffusionPolicyConfig
@@ -144,7 +145,7 @@ def spaces_of(batch: SegmentBatch) -> Spaces:
     """Of robots' observations and actions."""
     assert batch.actions is not None
     streams = {name: StreamSpec(tuple(s.shape[2:]), str(s.numpy().dtype)) for name, s in batch.observations.items()}
-    return Spaces(streams, BoxAction(-1.0, 1.0, tuple(batch.actions.shape[2:])))
+    return Spaces(streams, BoxAction(-1.0, 1.0, tuple(batch.actions.shape[2:]), (GRIPPER,)))
 
 
 def windows(recordings: Sequence[Recording], folder: Path, length: int) -> SegmentBatch:
